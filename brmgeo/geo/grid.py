@@ -1,0 +1,93 @@
+"""The region lattice: one grid of pixels, cut into blocks, with halos.
+
+A lattice is an ``odc.geo.GeoBox`` whose pixel edges lie on whole multiples of the GSD; every raster of a
+region is a window of it, so cropping, padding and overlapping are exact integer operations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from brmgeo.errors import SettingsError
+
+Bounds = tuple[float, float, float, float]
+
+
+def lattice(bounds: Bounds, crs: str, gsd_m: float) -> GeoBox:
+    """The smallest lattice of ``gsd_m`` pixels that covers ``bounds`` (left, bottom, right, top; metres).
+
+    Raises SettingsError for empty or non-finite bounds.
+    """
+    left, bottom, right, top = bounds
+    if not all(map(math.isfinite, bounds)) or not (right > left and top > bottom) or not gsd_m > 0:
+        raise SettingsError(f"bounds {bounds} at GSD {gsd_m} m span no area: give left < right and bottom < top")
+    # A hair of tolerance: 12.5 / 0.1 must not gain a pixel from binary fractions.
+    c0, r1 = math.floor(left / gsd_m + 1e-6), math.floor(bottom / gsd_m + 1e-6)
+    c1, r0 = math.ceil(right / gsd_m - 1e-6), math.ceil(top / gsd_m - 1e-6)
+    affine = Affine(gsd_m, 0.0, c0 * gsd_m, 0.0, -gsd_m, r0 * gsd_m)
+    return GeoBox((r0 - r1, c1 - c0), affine, crs)
+
+
+def bounds_of(box: GeoBox) -> Bounds:
+    """(left, bottom, right, top) of a lattice in its own CRS."""
+    b = box.extent.boundingbox
+    return (b.left, b.bottom, b.right, b.top)
+
+
+def gsd_of(box: GeoBox) -> float:
+    """Metres per pixel of a lattice."""
+    return float(box.affine.a)
+
+
+def pixel_from_world(box: GeoBox, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 2) float64 (row, col) in the edge convention from (n, 2) float64 world (x, y)."""
+    a = box.affine
+    xy = np.asarray(xy, dtype=np.float64)
+    return np.stack([(xy[..., 1] - a.f) / a.e, (xy[..., 0] - a.c) / a.a], axis=-1)
+
+
+def world_from_pixel(box: GeoBox, rc: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 2) float64 world (x, y) from (n, 2) float64 (row, col) in the edge convention."""
+    a = box.affine
+    rc = np.asarray(rc, dtype=np.float64)
+    return np.stack([a.c + rc[..., 1] * a.a, a.f + rc[..., 0] * a.e], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Rows [row, row + height) and columns [col, col + width) of a lattice."""
+
+    row: int
+    col: int
+    height: int
+    width: int
+
+    def padded(self, halo_px: int) -> Window:
+        """The window with ``halo_px`` more pixels on every side; it may reach outside the lattice."""
+        h = halo_px
+        return Window(self.row - h, self.col - h, self.height + 2 * h, self.width + 2 * h)
+
+    def box_in(self, box: GeoBox) -> GeoBox:
+        """This window's own lattice; also where it reaches outside ``box``."""
+        affine = box.affine * Affine.translation(self.col, self.row)
+        return GeoBox((self.height, self.width), affine, box.crs)
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Row and column slices into an array of the whole lattice."""
+        return slice(self.row, self.row + self.height), slice(self.col, self.col + self.width)
+
+
+def blocks(shape: tuple[int, int], size_px: int) -> Iterator[Window]:
+    """Windows of at most ``size_px`` square that tile ``shape`` (rows, cols) once, row by row."""
+    rows, cols = shape
+    for row in range(0, rows, size_px):
+        for col in range(0, cols, size_px):
+            yield Window(row, col, min(size_px, rows - row), min(size_px, cols - col))

@@ -1,0 +1,317 @@
+"""A region: a named area with one lattice, described by one TOML file.
+
+``load_region`` turns the file into a frozen, validated ``Region``. It is strict: an unknown key, a missing
+key or a value out of range is refused with file, key and the nearest valid key, so that a typing error never
+becomes a silently ignored setting.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from brmgeo.errors import MissingInputError, SettingsError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+
+# B0014111-B0014118 are buildings. B0014110 is "unclassified": allowed, not default. B0014119 bounds a group of houses.
+BUILDING_LAYERS = tuple(f"B001411{k}" for k in range(1, 9))
+GROUP_BOUNDARY_LAYER = "B0014119"
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class FootprintsSettings(_Settings):
+    """Where outlines come from. ``paths`` are files or globs below the region's source folder."""
+
+    paths: tuple[str, ...] = ("sheets/*.dxf",)
+    layers: tuple[str, ...] = BUILDING_LAYERS
+    snap_m: Annotated[float, Field(ge=0, le=1)] = 0.1
+    max_dropped_share: Share = 0.05
+    crs: str | None = None
+    encoding: str | None = None
+    layer: str | None = None
+    attribution: str = ""
+    repairs_layer: bool = False
+
+    @field_validator("paths", "layers", mode="before")
+    @classmethod
+    def _tuple(cls, value: Any) -> Any:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("layers")
+    @classmethod
+    def _no_group_boundary(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if GROUP_BOUNDARY_LAYER in value:
+            raise ValueError(
+                f"{GROUP_BOUNDARY_LAYER} bounds a group of houses and is not a building: remove it"
+            )
+        if not value:
+            raise ValueError("no layer is named")
+        return value
+
+
+class ImagerySettings(_Settings):
+    """Where imagery comes from.
+
+    ``kind``: ``tiles`` (a folder), ``mbtiles``, ``service`` (a URL template of the user's own, with the terms that
+    the user has checked) or ``raster`` (GeoTIFFs, world files, NGII ortho named by sheet number).
+    """
+
+    kind: Literal["tiles", "mbtiles", "service", "raster"]
+    path: str = "tiles"
+    grid: Literal["kakao", "webmercator"] = "kakao"
+    level: Annotated[int, Field(ge=0, le=24)] | None = None
+    template: str | None = None
+    url: str | None = None
+    key_env: str | None = None
+    connections: Annotated[int, Field(ge=1, le=16)] = 4
+    rate_per_s: Annotated[float, Field(gt=0, le=100)] = 5.0
+    retries: Annotated[int, Field(ge=0, le=20)] = 5
+    timeout_s: Positive = 20.0
+    missing_share: Share = 0.0
+    crs: str | None = None
+    attribution: str = ""
+    terms: str = ""
+    compression: Literal["jpeg", "zstd"] = "jpeg"
+
+    @model_validator(mode="after")
+    def _complete(self) -> ImagerySettings:
+        if self.kind in ("tiles", "service") and self.level is None:
+            raise ValueError(f"kind {self.kind!r} needs 'level', the zoom level of the tiles")
+        if self.kind == "service":
+            if not self.url:
+                raise ValueError("kind 'service' needs 'url', a template with {z}, {x} and {y}")
+            if not self.terms or not self.attribution:
+                raise ValueError(
+                    "kind 'service' needs 'terms' and 'attribution': state under which terms you may fetch the tiles"
+                )
+        return self
+
+
+class RatioSettings(_Settings):
+    """Radii of the ratio maps: given in metres, or from n, AGL and field of view by eq. 3."""
+
+    radii_m: tuple[Positive, ...] | None = None
+    n: Annotated[int, Field(ge=1, le=16)] | None = None
+    agl_m: Positive | None = None
+    fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
+
+    @field_validator("radii_m", mode="before")
+    @classmethod
+    def _tuple(cls, value: Any) -> Any:
+        return (
+            tuple(float(v) if isinstance(v, int) else v for v in value) if isinstance(value, list) else value
+        )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> RatioSettings:
+        derived = (self.n, self.agl_m, self.fov_deg)
+        if self.radii_m is not None:
+            if any(v is not None for v in derived):
+                raise ValueError("give either 'radii_m', or 'n', 'agl_m' and 'fov_deg' (eq. 3), not both")
+            if not self.radii_m:
+                raise ValueError("'radii_m' is empty")
+            if len(set(self.radii_m)) != len(self.radii_m):
+                raise ValueError("'radii_m' names a radius twice")
+        elif any(v is None for v in derived):
+            raise ValueError("give 'radii_m', or all of 'n', 'agl_m' and 'fov_deg' (eq. 3)")
+        return self
+
+    def radii(self) -> tuple[float, ...]:
+        """Radii in metres, largest first; eq. 3 where n, AGL and field of view are given."""
+        if self.radii_m is not None:
+            return tuple(sorted(self.radii_m, reverse=True))
+        assert self.n is not None and self.agl_m is not None and self.fov_deg is not None
+        ground = self.agl_m * math.tan(math.radians(self.fov_deg) / 2)
+        return tuple(ground * (self.n + 1 - k) / self.n for k in range(1, self.n + 1))
+
+
+class FlightSettings(_Settings):
+    """Defaults for simulated flights over the region and for matchers; the paper's figures."""
+
+    agl_m: Positive = 150.0
+    fov_deg: Annotated[float, Field(gt=0, lt=180)] = 43.0
+    width_px: Annotated[int, Field(ge=64, le=8192)] = 640
+    height_px: Annotated[int, Field(ge=64, le=8192)] = 480
+    speed_m_s: Positive = 5.0
+    interval_s: Positive = 5.0
+    max_speed_m_s: Positive = 20.0
+    rings: Annotated[int, Field(ge=1, le=16)] = 3
+    e1: Positive = 0.3
+    eps_m: Positive = 25.0
+    d_max_m: Positive = 75.0
+
+
+class TrainingSettings(_Settings):
+    """How training tiles are cut from the region; ``hold_out`` keeps the whole region for testing."""
+
+    tile_px: Annotated[int, Field(ge=64, le=2048, multiple_of=32)] = 512
+    overlap_px: Annotated[int, Field(ge=0, le=1024)] = 128
+    gsd_m: tuple[Positive, ...] = (0.23, 0.35, 0.47)
+    empty_share: Share = 0.2
+    hold_out: bool = False
+
+    @field_validator("gsd_m", mode="before")
+    @classmethod
+    def _tuple(cls, value: Any) -> Any:
+        return tuple(value) if isinstance(value, list) else value
+
+
+class GenerateSettings(_Settings):
+    """A region made by brmgeo itself: a seed is the whole recipe."""
+
+    seed: Annotated[int, Field(ge=0)]
+
+
+class Region(_Settings):
+    """One region. ``bounds`` are (left, bottom, right, top) metres in ``crs``; ``sheets`` NGII sheet numbers.
+
+    At least one of the two is given. With both, the lattice covers ``bounds`` and the map is known where the sheets lie.
+    """
+
+    name: Name
+    title: str = ""
+    crs: str
+    gsd_m: Annotated[float, Field(ge=0.05, le=10)] = 0.5
+    bounds: tuple[float, float, float, float] | None = None
+    sheets: tuple[str, ...] = ()
+    footprints: FootprintsSettings = FootprintsSettings()
+    imagery: ImagerySettings | None = None
+    ratio: RatioSettings = RatioSettings(n=3, agl_m=150.0, fov_deg=43.0)
+    flight: FlightSettings = FlightSettings()
+    training: TrainingSettings = TrainingSettings()
+    generate: GenerateSettings | None = None
+
+    @field_validator("bounds", mode="before")
+    @classmethod
+    def _floats(cls, value: Any) -> Any:
+        return (
+            tuple(float(v) if isinstance(v, int) else v for v in value) if isinstance(value, list) else value
+        )
+
+    @field_validator("sheets", mode="before")
+    @classmethod
+    def _tuple(cls, value: Any) -> Any:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("sheets")
+    @classmethod
+    def _numbers(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for number in value:
+            if not re.fullmatch(r"\d{5,9}", number):
+                raise ValueError(f"{number!r} is not an NGII sheet number of 5 to 9 digits")
+        if len(set(value)) != len(value):
+            raise ValueError("names a sheet twice")
+        return value
+
+    @field_validator("crs")
+    @classmethod
+    def _epsg(cls, value: str) -> str:
+        if not re.fullmatch(r"EPSG:\d{4,6}", value):
+            raise ValueError(f"{value!r} is not of the form 'EPSG:5187'")
+        return value
+
+    @model_validator(mode="after")
+    def _placed(self) -> Region:
+        if self.bounds is None and not self.sheets:
+            raise ValueError("give 'bounds' or 'sheets': the region has no place")
+        if self.bounds is not None:
+            left, bottom, right, top = self.bounds
+            if not (all(map(math.isfinite, self.bounds)) and left < right and bottom < top):
+                raise ValueError(
+                    "'bounds' must be [left, bottom, right, top] with left < right and bottom < top"
+                )
+        return self
+
+
+def load_region(path: Path) -> Region:
+    """The region that ``path`` describes.
+
+    Raises MissingInputError where there is no such file, SettingsError (one line: file, key, fault, nearest
+    valid key) for everything else.
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        known = sorted(p.stem for p in path.parent.glob("*.toml") if not p.stem.startswith("_"))
+        near = difflib.get_close_matches(path.stem, known, 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known) or 'none'};"
+        raise MissingInputError(
+            f"{path}: there is no region {path.stem!r}; {hint} `brmgeo new-region {path.stem} --sheets ...` writes one"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not valid TOML: {error}") from None
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        # TOML writes 2 for 2.0; whole numbers are welcome wherever a length or an angle is asked for.
+        region = Region.model_validate(_floats_where_asked(raw, Region))
+    except ValidationError as error:
+        raise SettingsError(f"{path}: {describe_fault(error, Region)}") from None
+    if region.name != path.stem:
+        raise SettingsError(
+            f"{path}: name: {region.name!r} differs from the file's name {path.stem!r}; make them equal"
+        )
+    return region
+
+
+def _floats_where_asked(raw: Any, model: type[BaseModel]) -> Any:
+    if not isinstance(raw, dict):
+        return raw
+    out = {}
+    for key, value in raw.items():
+        field = model.model_fields.get(key)
+        note = field.annotation if field else None
+        sub = _model_in(note)
+        if sub is not None and isinstance(value, dict):
+            value = _floats_where_asked(value, sub)
+        elif isinstance(value, int) and not isinstance(value, bool) and "float" in str(note):
+            value = float(value)
+        elif isinstance(value, list) and "float" in str(note):
+            value = [float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in value]
+        out[key] = value
+    return out
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    for kind in (annotation, *getattr(annotation, "__args__", ())):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            return kind
+    return None
+
+
+def describe_fault(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first faults of a pydantic error in one line, each with its key and, for a misspelt one, the nearest key."""
+    parts = []
+    for fault in error.errors()[:3]:
+        where = [str(p) for p in fault["loc"]]
+        keys: list[str] = []
+        owner: type[BaseModel] | None = model
+        for step in where[:-1]:
+            field = owner.model_fields.get(step) if owner else None
+            owner = _model_in(field.annotation) if field else None
+        if owner:
+            keys = sorted(owner.model_fields)
+        key = ".".join(where)
+        if fault["type"] == "extra_forbidden":
+            near = difflib.get_close_matches(where[-1], keys, 1, cutoff=0.4)
+            hint = f"nearest valid key is {near[0]!r}" if near else f"valid keys are {', '.join(keys)}"
+            parts.append(f"{key}: unknown key; {hint}")
+        elif fault["type"] == "missing":
+            parts.append(f"{key}: missing key; it is required")
+        else:
+            message = fault["msg"].removeprefix("Value error, ")
+            found = "" if isinstance(fault["input"], dict | BaseModel) else f" (found {fault['input']!r})"
+            parts.append(f"{key + ': ' if key else ''}{message}{found}")
+    return "; ".join(parts)

@@ -1,0 +1,1 @@
+"""The wiring: one module per job a user runs, and the ``brmgeo`` command."""
