@@ -132,7 +132,9 @@ class RatioSettings(_Settings):
         """Radii in metres, largest first; eq. 3 where n, AGL and field of view are given."""
         if self.radii_m is not None:
             return tuple(sorted(self.radii_m, reverse=True))
-        assert self.n is not None and self.agl_m is not None and self.fov_deg is not None
+        assert self.n is not None
+        assert self.agl_m is not None
+        assert self.fov_deg is not None
         ground = self.agl_m * math.tan(math.radians(self.fov_deg) / 2)
         return tuple(ground * (self.n + 1 - k) / self.n for k in range(1, self.n + 1))
 

@@ -27,7 +27,9 @@ def lattice(bounds: Bounds, crs: str, gsd_m: float) -> GeoBox:
     """
     left, bottom, right, top = bounds
     if not all(map(math.isfinite, bounds)) or not (right > left and top > bottom) or not gsd_m > 0:
-        raise SettingsError(f"bounds {bounds} at GSD {gsd_m} m span no area: give left < right and bottom < top")
+        raise SettingsError(
+            f"bounds {bounds} at GSD {gsd_m} m span no area: give left < right and bottom < top"
+        )
     # A hair of tolerance: 12.5 / 0.1 must not gain a pixel from binary fractions.
     c0, r1 = math.floor(left / gsd_m + 1e-6), math.floor(bottom / gsd_m + 1e-6)
     c1, r0 = math.ceil(right / gsd_m - 1e-6), math.ceil(top / gsd_m - 1e-6)
