@@ -1,0 +1,67 @@
+# brmgeo: the doors. `make` lists them.
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+SHELL := bash
+
+REGION ?= demo
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+BRMGEO := $(BIN)/brmgeo
+export SCHEDULER
+
+.PHONY: help setup maps status localize evaluate demo test test-fast test-slow qgis-test bench lint check clean
+
+help:  ## List these commands
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-10s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(STAMP)  ## Create .venv and install brmgeo with its tools
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "brmgeo needs Python 3.11 or newer; set PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "Python lacks venv: install the package python3-venv"; exit 2; }
+	@echo "setting up $(VENV) (a few minutes once)"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+maps: setup  ## Build all maps of REGION (default demo): footprints, imagery, buildings, ratio maps, QGIS project
+	@$(BRMGEO) maps $(REGION) $(ARGS)
+
+status: setup  ## Show which stages of REGION are fresh, and why the others are not
+	@$(BRMGEO) status $(REGION)
+
+localize: setup  ## Localize FLIGHT=folder (default: a simulated one) over REGION by METHOD=mask|ratio|paper
+	@$(BRMGEO) localize $(REGION) $(if $(FLIGHT),--flight $(FLIGHT)) $(if $(METHOD),--method $(METHOD)) $(ARGS)
+
+evaluate: setup  ## Fly many simulated flights over REGION through all three matchers and print the table
+	@$(BRMGEO) evaluate $(REGION) $(ARGS)
+
+demo: maps localize  ## Maps, a simulated flight and its report, over the embedded demo region
+
+test: setup  ## Run the tests (needs nothing but Python; real data and QGIS only where they are present)
+	$(BIN)/pytest -m "not slow" $(ARGS)
+
+test-slow: setup  ## Run the long tests too
+	$(BIN)/pytest $(ARGS)
+
+qgis-test: setup  ## Open the demo's QGIS projects in a real QGIS, check and render them (needs qgis, python3-qgis)
+	@command -v qgis >/dev/null || { echo "QGIS is not installed: apt-get install qgis python3-qgis"; exit 2; }
+	$(BIN)/pytest -m "slow or not slow" tests/export/test_qgis.py $(ARGS)
+
+bench: setup  ## Measure the kernels against their alternatives and rewrite the tables in docs/
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
+	$(BIN)/python benchmarks/ratio_maps.py
+	$(BIN)/python benchmarks/dxf_readers.py
+	$(BIN)/python benchmarks/matchers.py
+
+lint: setup  ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+check: lint test  ## Everything a change must pass
+
+clean:  ## Remove built maps and the store (data/source stays)
+	rm -rf data/work data/out

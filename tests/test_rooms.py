@@ -1,0 +1,108 @@
+"""Who may know whom: the imports between the rooms of the house are held against the picture in docs/ARCHITECTURE.md."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+VALUES = {"brmgeo.errors", "brmgeo.region", "brmgeo.geo", "brmgeo.flight.values", "brmgeo.ingest.values"}
+KERNELS = {
+    "brmgeo.maps.ratio",
+    "brmgeo.match",
+    "brmgeo.flight.camera",
+    "brmgeo.flight.view",
+    "brmgeo.flight.motion",
+}
+ADAPTERS = {"brmgeo.ingest", "brmgeo.export", "brmgeo.flight.folder", "brmgeo.flight.odometry"}
+# What each room may import besides itself and plain values; everything not named here may not be known.
+MAY_KNOW = {
+    "brmgeo.errors": set[str](),
+    "brmgeo.region": {"brmgeo.errors"},
+    "brmgeo.geo": {"brmgeo.errors"},
+    "brmgeo.flight.values": set[str](),
+    "brmgeo.maps": VALUES,
+    "brmgeo.match": VALUES | {"brmgeo.maps.ratio", "brmgeo.flight.view"},
+    "brmgeo.flight": VALUES | {"brmgeo.maps.ratio"},
+    "brmgeo.ingest": VALUES,
+    "brmgeo.export": VALUES,
+    "brmgeo.evaluate": VALUES,
+    "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
+    "brmgeo.workflow": {"brmgeo.errors", "brmgeo"},
+}
+# Libraries that live in one room only.
+ONLY_IN = {
+    "dask": {"brmgeo.workflow"},
+    "distributed": {"brmgeo.workflow"},
+    "torch": {"brmgeo.segment"},
+    "httpx": {"brmgeo.ingest"},
+}
+FORBIDDEN_IN_KERNELS = {"pathlib", "rasterio", "pyproj", "geopandas", "pyogrio", "logging"}
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for folder in ("brmgeo", "pipelines"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports_of(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def inside(name: str, room: str) -> bool:
+    return name == room or name.startswith(room + ".")
+
+
+def room_of(module: str) -> str | None:
+    rooms = [room for room in MAY_KNOW if inside(module, room)]
+    return max(rooms, key=len) if rooms else None
+
+
+@pytest.mark.parametrize("module", sorted(modules()))
+def test_a_room_knows_only_what_the_picture_allows(module: str) -> None:
+    known = set(modules())
+    own = {name for name in imports_of(modules()[module]) if name in known and name != "brmgeo"}
+    if inside(module, "pipelines"):
+        return
+    room = room_of(module)
+    if room is None:
+        assert module == "brmgeo", f"{module} belongs to no room: add it to docs/ARCHITECTURE.md and to this test"
+        assert not own
+        return
+    for name in own:
+        allowed = inside(name, room) or any(inside(name, other) for other in MAY_KNOW[room])
+        assert allowed, f"{module} imports {name}: a new arrow; {room} may know {sorted(MAY_KNOW[room])}"
+
+
+@pytest.mark.parametrize("module", sorted(modules()))
+def test_kernels_and_adapters_do_not_know_each_other(module: str) -> None:
+    own = imports_of(modules()[module])
+    kernel = any(inside(module, name) for name in KERNELS)
+    adapter = any(inside(module, name) for name in ADAPTERS) and module not in VALUES
+    if kernel:
+        assert not {n for n in own for a in ADAPTERS if inside(n, a) and n not in VALUES}
+        assert not {n for n in own if n.split(".")[0] in FORBIDDEN_IN_KERNELS}, "a kernel takes arrays and numbers"
+    if adapter:
+        assert not {n for n in own for k in KERNELS if inside(n, k)}
+
+
+@pytest.mark.parametrize("module", sorted(modules()))
+def test_libraries_stay_in_their_room(module: str) -> None:
+    top = {name.split(".")[0] for name in imports_of(modules()[module])}
+    for library, rooms in ONLY_IN.items():
+        if library in top:
+            assert any(inside(module, room) for room in rooms), f"{module} imports {library}"
+    assert "pipelines" not in top or inside(module, "pipelines")
