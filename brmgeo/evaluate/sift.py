@@ -69,10 +69,9 @@ class SiftMatcher:
             return None
         source = points[[m.queryIdx for m in good]]
         target = self._points[[m.trainIdx for m in good]]
-        found: tuple[NDArray[np.float64] | None, NDArray[np.uint8]] = cv2.estimateAffinePartial2D(  # type: ignore[assignment]
+        matrix, kept = cv2.estimateAffinePartial2D(
             source, target, method=cv2.RANSAC, ransacReprojThreshold=4.0, maxIters=5000, confidence=0.999
         )
-        matrix, kept = found
         if matrix is None:
             return None
         inliers = int(kept.sum())
