@@ -1,0 +1,303 @@
+"""Where a stage's ``map`` runs: in this process, on a local Dask cluster, or on one that is there already.
+
+Dask is imported, and a local cluster started, by the first ``map`` that has two items or more: a run that has nothing to do
+waits for neither. Items are handed out a few at a time, so results wait in memory for a bounded number of blocks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import logging
+import os
+import socket
+import sys
+import tempfile
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import brmgeo
+from brmgeo.errors import SettingsError, WorkflowError
+from brmgeo.workflow.stage import Map, R, T
+
+_MEMORY_SHARE = 0.7
+_CONNECT_S = 5.0
+
+
+def serial_map(function: Callable[[T], R], items: Iterable[T], /) -> Iterator[R]:
+    """``map`` in this process, one item after another."""
+    for item in items:
+        yield function(item)
+
+
+@contextlib.contextmanager
+def scheduler(
+    spec: str | None,
+    *,
+    shared: Path | str | None = None,
+    workers: int | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Iterator[Map]:
+    """The ``map`` that ``spec`` names, closed at the end.
+
+    Args:
+        spec: ``serial`` (this process), None, empty or ``local`` (a cluster of this machine's own, one thread a
+            worker, started when there is work), or the address of a running Dask scheduler such as ``tcp://host:8786``.
+        shared: folder that the workers must see (the store); Dask's warnings go to ``dask.log`` in it.
+        workers: workers of a local cluster; the number of CPUs that this process may use by default.
+        say: takes the line that tells the dashboard's address.
+
+    Raises SettingsError for another ``spec``; from the first ``map`` on, WorkflowError when the scheduler does not answer,
+    has no workers, or has workers with another brmgeo or without the shared folder, or when workers die
+    again and again over one item.
+    """
+    spec = (spec or "local").strip()
+    if spec == "serial":
+        yield serial_map
+        return
+    address = None if spec == "local" else spec
+    if address is not None and (urlsplit(address).scheme not in ("tcp", "tls") or not _port(address)):
+        raise SettingsError(f"scheduler {spec!r}: give serial, local or an address such as tcp://host:8786")
+    cluster = _Dask(
+        address, Path(shared or tempfile.gettempdir()).absolute(), workers, say or (lambda line: None)
+    )
+    try:
+        yield cluster.map
+    finally:
+        cluster.close()
+
+
+class _Dask:
+    """A Dask cluster that starts with the first work."""
+
+    def __init__(
+        self, address: str | None, shared: Path, workers: int | None, say: Callable[[str], None]
+    ) -> None:
+        self._address = address
+        self._shared = shared
+        self._workers = workers
+        self._say = say
+        self._stack = contextlib.ExitStack()
+        self._client: Any = None
+
+    def map(self, function: Callable[[T], R], items: Iterable[T], /) -> Iterator[R]:
+        work = list(items)
+        if len(work) < 2 and self._client is None and self._address is None:
+            yield from serial_map(function, work)  # one item needs no company
+            return
+        client = self._start()
+        from distributed import CancelledError, KilledWorker
+
+        threads = max(1, sum(client.nthreads().values()))
+        waiting = iter(work)
+        flying: deque[Any] = deque()
+        try:
+            while True:
+                while len(flying) < 2 * threads + 1 and (item := next(waiting, flying)) is not flying:
+                    flying.append(client.submit(function, item, pure=False))
+                if not flying:
+                    return
+                result: R = flying[0].result()
+                flying.popleft().release()
+                yield result
+        except KilledWorker as error:
+            raise WorkflowError(
+                f"{_name(function)}: {error.allowed_failures + 1} workers died one after another over the same item, "
+                f"most often for lack of memory; use smaller blocks or SCHEDULER=serial, see {self._shared / 'dask.log'}"
+            ) from None
+        except (CancelledError, TimeoutError, OSError) as error:
+            if client.status == "running" and not isinstance(error, CancelledError):
+                raise
+            raise WorkflowError(
+                f"{_name(function)}: the scheduler {self._address or 'of this machine'} went away; start it and run again"
+            ) from None
+        finally:
+            for future in flying:
+                with contextlib.suppress(Exception):
+                    future.cancel()
+
+    def close(self) -> None:
+        self._client = None
+        self._stack.close()
+
+    def _start(self) -> Any:
+        if self._client is None:
+            try:
+                self._client = self._connect() if self._address else self._launch()
+            except BaseException:
+                self._stack.close()
+                raise
+        return self._client
+
+    def _launch(self) -> Any:
+        import dask
+        from dask.system import CPU_COUNT
+        from distributed import Client, LocalCluster
+        from distributed.system import MEMORY_LIMIT
+        from psutil import virtual_memory
+
+        workers = self._workers or CPU_COUNT
+        memory = int(min(virtual_memory().available, MEMORY_LIMIT) * _MEMORY_SHARE / workers)
+        # Each worker is one of several on this machine: its libraries must not take all the cores for themselves.
+        threads = {
+            "NUMBA_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "MKL_NUM_THREADS": "1",
+        }
+        scratch = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="brmgeo-dask-"))
+        self._stack.enter_context(
+            dask.config.set({"distributed.nanny.pre-spawn-environ": threads, "temporary-directory": scratch})
+        )
+        log = self._shared / "dask.log"
+        self._stack.enter_context(_logs_to(log))
+        try:
+            cluster = self._stack.enter_context(
+                LocalCluster(  # type: ignore[no-untyped-call]
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    memory_limit=memory,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0" if _has_dashboard() else None,
+                    silence_logs=logging.WARNING,
+                )
+            )
+            client = self._stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise WorkflowError(
+                f"the local Dask cluster does not start ({error}); run with SCHEDULER=serial, see {log}"
+            ) from error
+        client.register_plugin(_worker_log(log))
+        where = (
+            f"dashboard {cluster.dashboard_link}"
+            if _has_dashboard()
+            else f"scheduler {cluster.scheduler_address}"
+        )
+        self._say(f"{workers} workers of {memory / 2**30:.1f} GiB on this machine, {where}")
+        return client
+
+    def _connect(self) -> Any:
+        assert self._address is not None
+        parts = urlsplit(self._address)
+        try:
+            socket.create_connection((parts.hostname or "", parts.port or 0), timeout=_CONNECT_S).close()
+        except OSError as error:
+            raise WorkflowError(
+                f"scheduler {self._address} does not answer ({error.strerror or error}); start it with "
+                "`dask scheduler`, or leave SCHEDULER empty for this machine's own"
+            ) from None
+        from distributed import Client
+
+        self._stack.enter_context(_logs_to(self._shared / "dask.log"))
+        try:
+            client = self._stack.enter_context(Client(self._address, timeout=_CONNECT_S))  # type: ignore[no-untyped-call]
+        except (OSError, TimeoutError, ValueError) as error:
+            raise WorkflowError(
+                f"scheduler {self._address}: something answers there, but not a Dask scheduler of our version ({error})"
+            ) from None
+        if not client.nthreads():
+            raise WorkflowError(
+                f"scheduler {self._address} has no workers; start some with `dask worker {self._address}`"
+            )
+        self._require_same_house(client)
+        self._say(f"{len(client.nthreads())} workers of {self._address}, dashboard {client.dashboard_link}")
+        return client
+
+    def _require_same_house(self, client: Any) -> None:
+        """Workers elsewhere must see the store and run this very code: keys do not tell one code from another."""
+        token = self._shared / f".seen-{uuid.uuid4().hex}"
+        token.touch()
+        try:
+            answers = client.run(_look_around, str(token), on_error="return")
+        finally:
+            token.unlink(missing_ok=True)
+        mine = _house()
+        for worker, answer in answers.items():
+            if isinstance(answer, BaseException):
+                raise WorkflowError(
+                    f"worker {worker} cannot import brmgeo ({answer}); install brmgeo {brmgeo.__version__} there"
+                )
+            sees, house = answer
+            if not sees:
+                raise WorkflowError(
+                    f"worker {worker} does not see {self._shared}; mount the same file system there, at the same path"
+                )
+            if house != mine:
+                raise WorkflowError(
+                    f"worker {worker} runs {house}, this is {mine}; install the same brmgeo and Python there and restart it"
+                )
+
+
+def _house() -> str:
+    """Python, brmgeo's version and a digest of its text, as one line."""
+    digest = hashlib.sha256()
+    root = Path(brmgeo.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return f"brmgeo {brmgeo.__version__} ({digest.hexdigest()[:8]}) on Python {sys.version_info[0]}.{sys.version_info[1]}"
+
+
+def _look_around(token: str) -> tuple[bool, str]:
+    return os.path.exists(token), _house()
+
+
+def _worker_log(path: Path) -> Any:
+    """A worker plugin, so that restarted workers have it too: Dask's warnings go to a file instead of the terminal."""
+    from distributed import WorkerPlugin
+
+    class WorkerLog(WorkerPlugin):  # type: ignore[misc,unused-ignore]
+        name = "brmgeo-log"
+
+        def setup(self, worker: Any) -> None:
+            _redirect(path)
+
+    return WorkerLog()
+
+
+@contextlib.contextmanager
+def _logs_to(path: Path) -> Iterator[None]:
+    """Dask's and Tornado's warnings go to ``path`` while the body runs."""
+    before = _redirect(path)
+    try:
+        yield
+    finally:
+        for logger, handlers, level, propagate in before:
+            for handler in logger.handlers:
+                handler.close()
+            logger.handlers, logger.propagate = handlers, propagate
+            logger.setLevel(level)
+
+
+def _redirect(path: Path) -> list[tuple[logging.Logger, list[logging.Handler], int, bool]]:
+    import distributed  # noqa: F401  # it sets up its loggers when imported, and would undo this later
+
+    before = []
+    for name in ("distributed", "distributed.client", "tornado", "bokeh"):
+        logger = logging.getLogger(name)
+        before.append((logger, logger.handlers, logger.level, logger.propagate))
+        handler = logging.FileHandler(path, delay=True)
+        handler.setFormatter(logging.Formatter("%(asctime)s %(process)d %(name)s %(levelname)s %(message)s"))
+        logger.handlers, logger.propagate = [handler], False
+        logger.setLevel(logging.WARNING)
+    return before
+
+
+def _has_dashboard() -> bool:
+    return importlib.util.find_spec("bokeh") is not None
+
+
+def _port(address: str) -> int:
+    try:
+        return urlsplit(address).port or 0
+    except ValueError:
+        return 0
+
+
+def _name(function: Callable[..., object]) -> str:
+    inner = getattr(function, "func", function)
+    return str(getattr(inner, "__qualname__", inner))
