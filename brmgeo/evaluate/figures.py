@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -77,7 +78,9 @@ def paths_figure(background: Background, paths: Paths, estimates: Sequence[Estim
             axes.plot(*path.T, style, color=colour, linewidth=width, solid_capstyle="round")
             handles.append(Line2D([], [], color=colour, linestyle=style, linewidth=width, label=label))
         if len(fixes):
-            axes.scatter(*fixes.T, s=26, color=ONLINE, edgecolor="black", linewidth=0.6, zorder=5)
+            axes.scatter(
+                fixes[:, 0], fixes[:, 1], s=26, color=ONLINE, edgecolor="black", linewidth=0.6, zorder=5
+            )
             axes.scatter(
                 *fixes[0], s=150, marker="*", color="#ffe066", edgecolor="black", linewidth=0.9, zorder=6
             )
@@ -254,11 +257,12 @@ def _candidates(axes: Axes, estimate: Estimate, size: float) -> None:
         mass = estimate.candidate_mass
         peak = float(mass.max()) if len(mass) else 1.0
         alpha = np.clip(0.25 + 0.75 * mass / peak, 0.25, 1.0) if peak > 0 else np.full(len(mass), 0.4)
-        axes.scatter(*estimate.candidates.T, s=size, color=CANDIDATE, alpha=alpha, linewidth=0)
+        colours = np.column_stack([np.tile(to_rgb(CANDIDATE), (len(alpha), 1)), alpha])
+        axes.scatter(estimate.candidates[:, 0], estimate.candidates[:, 1], s=size, color=colours, linewidth=0)
 
 
 def _truth(axes: Axes, xy: NDArray[np.float64]) -> None:
-    axes.scatter(*xy, s=90, marker="P", color="#00b4d8", edgecolor="white", linewidth=1.0, zorder=6)
+    axes.scatter(xy[0], xy[1], s=90, marker="P", color="#00b4d8", edgecolor="white", linewidth=1.0, zorder=6)
 
 
 def _dot(colour: str, marker: str, label: str, size: float = 6) -> Line2D:

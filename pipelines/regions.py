@@ -1,0 +1,149 @@
+"""Region files: finding them, and writing new ones from sheet numbers or bounds."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+from pathlib import Path
+
+from pyproj import Transformer
+
+from brmgeo.errors import SettingsError
+from brmgeo.geo.crs import (
+    LONLAT,
+    belt_for_lon,
+    belt_for_sheet,
+    require_projected_metres,
+    transform_bounds,
+    transformer,
+)
+from brmgeo.geo.grid import Bounds
+from brmgeo.geo.sheets import sheet_extent, sheets_covering
+from brmgeo.region import Region, load_region
+
+NGII = "https://map.ngii.go.kr"
+
+_TEXT = """\
+# Region {name}: see data/regions/_template.toml for every key that a region can have.
+name = "{name}"
+title = "{title}"
+crs = "{crs}"                # {crs_note}
+gsd_m = 0.5
+{bounds}sheets = [{sheets}]
+
+[footprints]
+paths = ["sheets/*.dxf"]         # below data/source/{name}/
+attribution = "국토지리정보원 (National Geographic Information Institute), 수치지형도"
+
+# [imagery]                      # optional: uncomment one of the kinds described in _template.toml
+# kind = "tiles"
+# path = "tiles"
+# grid = "kakao"
+# level = 1
+# attribution = "..."
+# terms = "..."
+
+[ratio]                          # radii by eq. 3: (n + 1 - k) / n * agl_m * tan(fov_deg / 2)
+n = 3
+agl_m = 150.0
+fov_deg = 43.0
+"""
+
+
+def region_named(name: str, data: Path) -> tuple[Region, Path]:
+    """The region of that name (or of that TOML file) and the folder whose source/, work/ and out/ belong to it."""
+    if name.endswith(".toml") or "/" in name:
+        return load_region(Path(name)), data
+    return load_region(data / "regions" / f"{name}.toml"), data
+
+
+def new_region(
+    name: str,
+    data: Path,
+    sheets: tuple[str, ...] = (),
+    bounds: Bounds | None = None,
+    bounds_crs: str = LONLAT,
+    title: str = "",
+) -> Path:
+    """Writes data/regions/NAME.toml from sheet numbers or bounds, and returns its path.
+
+    The belt's CRS follows from the sheet numbers, or from the longitude of the bounds' centre; the sheets that
+    cover the bounds are worked out. Raises SettingsError for a name that exists or cannot be one, and for sheets
+    of different belts.
+    """
+    path = data / "regions" / f"{name}.toml"
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise SettingsError(
+            f"new region {name!r}: a name has letters, digits, - and _ only, and begins with one of the first two"
+        )
+    if path.exists():
+        raise SettingsError(f"{path} exists: choose another name, or remove the file first")
+    if bool(sheets) == (bounds is not None):
+        raise SettingsError(f"new region {name}: give either --sheets or --bounds")
+    text_bounds = ""
+    if bounds is None:
+        belts = sorted({belt_for_sheet(s) for s in sheets})
+        extents = [sheet_extent(s, belts[0]) for s in sheets]
+        if len(belts) > 1:
+            raise SettingsError(
+                f"new region {name}: sheets lie in the belts {', '.join(belts)}; give the sheets of one belt, or --bounds"
+            )
+        crs, note = belts[0], "the belt of these sheets"
+        left, bottom = min(e[0] for e in extents), min(e[1] for e in extents)
+        right, top = max(e[2] for e in extents), max(e[3] for e in extents)
+        note += f": x {left:.0f}..{right:.0f}, y {bottom:.0f}..{top:.0f}"
+    else:
+        crs, placed = _in_metres(name, bounds, bounds_crs)
+        sheets = tuple(sheets_covering(placed, crs))
+        text_bounds = (
+            f"bounds = [{', '.join(f'{v:.1f}' for v in placed)}]   # left, bottom, right, top in metres\n"
+        )
+        note = "the belt at this longitude"
+    text = _TEXT.format(
+        name=name,
+        title=title or name,
+        crs=crs,
+        crs_note=note,
+        bounds=text_bounds,
+        sheets=", ".join(f'"{s}"' for s in sheets),
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text(text, encoding="utf-8")
+    shutil.move(part, path)
+    load_region(path)
+    return path
+
+
+def _in_metres(name: str, bounds: Bounds, bounds_crs: str) -> tuple[str, Bounds]:
+    """The belt's CRS and the bounds in it, widened to whole metres."""
+    left, bottom, right, top = bounds
+    if not all(map(math.isfinite, bounds)) or not (left < right and bottom < top):
+        raise SettingsError(
+            f"new region {name}: bounds {bounds} must be left,bottom,right,top with left < right, bottom < top"
+        )
+    if bounds_crs == LONLAT:
+        if max(abs(left), abs(right)) > 180 or max(abs(bottom), abs(top)) > 90:
+            raise SettingsError(
+                f"new region {name}: bounds {bounds} are not degrees; give --crs EPSG:... for bounds in metres"
+            )
+        crs = belt_for_lon((left + right) / 2)
+        left, bottom, right, top = transform_bounds(LONLAT, crs, bounds)
+    else:
+        require_projected_metres(bounds_crs)
+        to_lonlat: Transformer = transformer(bounds_crs, LONLAT)
+        lon, _ = to_lonlat.transform((left + right) / 2, (bottom + top) / 2)
+        crs = bounds_crs
+        belt_for_lon(lon)  # sheets exist in Korea only: outside, this says so
+    return crs, (
+        float(math.floor(left)),
+        float(math.floor(bottom)),
+        float(math.ceil(right)),
+        float(math.ceil(top)),
+    )
+
+
+def where_to_get(sheet: str) -> str:
+    """How a person gets an NGII sheet, in half a sentence."""
+    return f"{NGII} (국토정보플랫폼, 수치지형도, sheet {sheet}; free after registering)"
