@@ -82,7 +82,14 @@ def paths_figure(background: Background, paths: Paths, estimates: Sequence[Estim
                 fixes[:, 0], fixes[:, 1], s=26, color=ONLINE, edgecolor="black", linewidth=0.6, zorder=5
             )
             axes.scatter(
-                *fixes[0], s=150, marker="*", color="#ffe066", edgecolor="black", linewidth=0.9, zorder=6
+                fixes[0, 0],
+                fixes[0, 1],
+                s=150,
+                marker="*",
+                color="#ffe066",
+                edgecolor="black",
+                linewidth=0.9,
+                zorder=6,
             )
             handles.append(_dot(ONLINE, "o", "online fixes"))
             handles.append(_dot("#ffe066", "*", "first fix", 11))
