@@ -1,0 +1,635 @@
+"""Building ratio maps: how much of the disc around every pixel is building, counted exactly.
+
+Method: a bit-sliced sliding disc
+---------------------------------
+The count of a pixel's disc follows from the count one row above: the disc gains one pixel per column on its lower
+arc and loses one per column on its upper arc, 2 (2R + 1) pixels for R whole pixels of radius. What is written on
+the mask does not matter, so rural and dense maps cost the same. Three ideas make it fast.
+
+1. *Sixteen pixels in one word.* A row is cut into 16 strips of S columns. Word ``j`` of the packed row holds, in bit
+   ``k``, the mask at column ``k S + j``. The neighbour ``dx`` columns away of all 16 pixels is then word ``j + dx``:
+   no bit is ever shifted. Rows are stored with a border so that ``j + dx`` always exists, and neighbouring words lie
+   side by side in memory, so the compiler turns the loops over ``j`` into vector instructions.
+2. *Carry-save adders.* The counts of a row are held in bit planes: plane ``p`` has bit ``p`` of every count, in the
+   layout of the packed mask. A full adder takes three words of the same weight to one of this weight
+   (``a ^ b ^ c``) and one of double weight (the majority). Fifteen of them add 16 arc words to four planes and
+   leave one carry of weight 16; the carries of all groups are added to the next four planes in the same way, and
+   the few carries of weight 256 ripple through the rest.
+3. *Subtracting by adding.* Beside the packed mask lies its complement. A pixel that leaves is added as ``1 - pixel``,
+   and the number of ones that this puts in is the same for all pixels of a row: it is taken off, modulo a power of
+   two, when the planes are turned back into numbers by a 16 x 16 bit transposition (four rounds of swaps).
+
+Counts are integers throughout and a ratio is one division at the end, so a block with ``halo_px`` more pixels on each
+side gives bit for bit what the whole map gives.
+
+A pixel belongs to the disc when its centre does: dx^2 + dy^2 <= r^2, with any positive r. Known pixels of a disc are
+those of the disc clipped to the array (from chord sums, no pass over the map) less the unknown ones (a second
+sliding disc, run only over the part of the array that unknown pixels can reach).
+
+Sources: carry-save counting after Harley and Seal (H. S. Warren, Hacker's Delight, 2nd ed., 5-1) and bit matrix
+transposition (7-3); ratio maps and disc radii after eq. 1 and 3 of the building ratio map paper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+NODATA = 65535
+"""Ratio value of a pixel whose disc holds no known pixel."""
+UNIT = 10_000
+"""A ratio of one, in the units of ``ratio_maps``."""
+UNKNOWN = 255
+"""Mask value of a pixel of which nothing is known."""
+
+_LANES = 16  # pixels in a packed word
+_STRIP_MAX = 512  # words of a strip that are worked on at a time: keeps planes and carries in the first-level cache
+_START_INPUTS = 4096  # disc pixels added at a time while a first row is counted
+
+_Count = NDArray[np.uint16] | NDArray[np.uint32]
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def _jit(function: _F) -> _F:
+    """numba.njit that compiles at the first call, keeps the result on disk and lets go of the GIL."""
+    return cast(_F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+# --- adders on words; the casts keep numba from widening 16-bit words to 64 bits -------------------------------
+
+
+@_jit
+def _sum(a: Any, b: Any, c: Any) -> Any:
+    return np.uint16(np.uint16(a ^ b) ^ c)
+
+
+@_jit
+def _carry(a: Any, b: Any, c: Any) -> Any:
+    return np.uint16(np.uint16(a & b) | np.uint16(c & np.uint16(a | b)))
+
+
+@_jit
+def _add_16(words: Any, at: Any, planes: Any, lowest: int, carry: Any) -> None:
+    """Adds 16 rows of words to planes[lowest : lowest + 4]; what overflows, of 16 times the weight, goes to carry.
+
+    at: (16,) uint64 positions in words (flat) of the rows. Unsigned, since numba would test a signed index for
+    counting from the end and the loop would no longer be vectorised.
+    """
+    a0, a1, a2, a3, a4, a5, a6, a7 = at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7]
+    b0, b1, b2, b3, b4, b5, b6, b7 = at[8], at[9], at[10], at[11], at[12], at[13], at[14], at[15]
+    p1, p2, p4, p8 = planes[lowest], planes[lowest + 1], planes[lowest + 2], planes[lowest + 3]
+    for index in range(carry.size):
+        i = np.uint64(index)
+        s = p1[i]
+        x, y = words[a0 + i], words[b0 + i]
+        c0, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a1 + i], words[b1 + i]
+        c1, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a2 + i], words[b2 + i]
+        c2, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a3 + i], words[b3 + i]
+        c3, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a4 + i], words[b4 + i]
+        c4, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a5 + i], words[b5 + i]
+        c5, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a6 + i], words[b6 + i]
+        c6, s = _carry(s, x, y), _sum(s, x, y)
+        x, y = words[a7 + i], words[b7 + i]
+        c7, s = _carry(s, x, y), _sum(s, x, y)
+        p1[i] = s
+        s = p2[i]
+        d0, s = _carry(s, c0, c1), _sum(s, c0, c1)
+        d1, s = _carry(s, c2, c3), _sum(s, c2, c3)
+        d2, s = _carry(s, c4, c5), _sum(s, c4, c5)
+        d3, s = _carry(s, c6, c7), _sum(s, c6, c7)
+        p2[i] = s
+        s = p4[i]
+        e0, s = _carry(s, d0, d1), _sum(s, d0, d1)
+        e1, s = _carry(s, d2, d3), _sum(s, d2, d3)
+        p4[i] = s
+        s = p8[i]
+        carry[i] = _carry(s, e0, e1)
+        p8[i] = _sum(s, e0, e1)
+
+
+@_jit
+def _ripple(carry: Any, planes: Any, lowest: int) -> None:
+    """Adds one row of words (overwritten) to planes[lowest:], modulo the number of planes."""
+    for p in range(lowest, planes.shape[0]):
+        plane = planes[p]
+        for i in range(carry.size):
+            x, c = plane[i], carry[i]
+            plane[i] = np.uint16(x ^ c)
+            carry[i] = np.uint16(x & c)
+
+
+@_jit
+def _add(words: Any, base: int, offsets: Any, planes: Any, carries: Any, at: Any) -> None:
+    """Adds the rows of words at base + offsets (a multiple of 16 of them) to the planes.
+
+    carries: (offsets / 16 rounded up to 16, and one more; or larger, S) scratch; at: (16,) uint64 scratch.
+    """
+    groups = offsets.size // 16
+    for g in range(groups):
+        for k in range(16):
+            at[k] = np.uint64(base + offsets[16 * g + k])
+        _add_16(words, at, planes, 0, carries[g])
+    flat = carries.reshape(-1)
+    width = carries.shape[1]
+    last = carries[carries.shape[0] - 1]
+    for first in range(0, groups, 16):
+        carries[groups : first + 16] = 0
+        for k in range(16):
+            at[k] = np.uint64((first + k) * width)
+        _add_16(flat, at, planes, 4, last)
+        _ripple(last, planes, 8)
+
+
+# --- words to numbers ------------------------------------------------------------------------------------------
+
+
+@_jit
+def _transpose(square: Any) -> None:
+    """(16, S) words: bit k of word p changes places with bit p of word k."""
+    for shift, mask in ((8, 0x00FF), (4, 0x0F0F), (2, 0x3333), (1, 0x5555)):
+        s, m = np.uint16(shift), np.uint16(mask)
+        for p in range(16):
+            if p & shift:
+                continue
+            low, high = square[p], square[p + shift]
+            for i in range(low.size):
+                a, b = low[i], high[i]
+                t = np.uint16(np.uint16(np.uint16(a >> s) ^ b) & m)
+                high[i] = np.uint16(b ^ t)
+                low[i] = np.uint16(a ^ np.uint16(t << s))
+
+
+@_jit
+def _emit(planes: Any, bias: int, square: Any, row: Any) -> None:
+    """Writes the counts held in planes, less bias, to row (uint16, or uint32 where more than 16 planes are used)."""
+    used = planes.shape[0]
+    width = square.shape[1]
+    square[: min(used, 16)] = planes[: min(used, 16)]
+    square[min(used, 16) :] = 0
+    _transpose(square)
+    low_bias, low_mask = np.uint16(bias & 0xFFFF), np.uint16(((1 << used) - 1) & 0xFFFF)
+    for k in range(_LANES):
+        piece, source = row[k * width : (k + 1) * width], square[k]
+        if used <= 16:
+            for i in range(piece.size):
+                piece[i] = np.uint16(np.uint16(source[i] - low_bias) & low_mask)
+        else:
+            for i in range(piece.size):
+                piece[i] = source[i]
+    if used <= 16:
+        return
+    square[: used - 16] = planes[16:]
+    square[used - 16 :] = 0
+    _transpose(square)
+    all_bias, all_mask = np.uint32(bias & 0xFFFFFFFF), np.uint32((1 << used) - 1)
+    for k in range(_LANES):
+        piece, source = row[k * width : (k + 1) * width], square[k]
+        for i in range(piece.size):
+            value = np.uint32(np.uint32(source[i]) << np.uint32(16)) | np.uint32(piece[i])
+            piece[i] = np.uint32(np.uint32(value - all_bias) & all_mask)
+
+
+# --- packing and sliding ---------------------------------------------------------------------------------------
+
+
+@_jit
+def _pack(mask: Any, value: int, row0: int, col0: int, border: Any, words: Any) -> None:
+    """Packs ``mask == value`` around a tile into words[0] and its complement into words[1].
+
+    words: (2, h + 2 by + 1, S + 2 bx) uint16 for a tile of h rows whose first pixel is (row0, col0), border (by, bx).
+    Bit k of words[0, y + by, j + bx] is pixel (row0 + y, col0 + k S + j); pixels outside the array are 0. The row
+    after the last holds zeros, for sums that need something to add that changes nothing.
+    """
+    height, width = mask.shape
+    by, bx = border
+    n = words.shape[2]
+    strip = n - 2 * bx
+    v = np.uint8(value)
+    for line in range(words.shape[1]):
+        packed, complement = words[0, line], words[1, line]
+        packed[:] = 0
+        y = row0 + line - by
+        if 0 <= y < height and line < words.shape[1] - 1:
+            source = mask[y]
+            for k in range(_LANES):
+                first = col0 + k * strip - bx  # the column of word 0
+                lo, hi = min(max(0, -first), n), max(0, min(n, width - first))
+                if lo < hi:
+                    pixels, target, shift = source[first + lo : first + hi], packed[lo:hi], np.uint16(k)
+                    for i in range(pixels.size):
+                        target[i] |= np.uint16(np.uint16(pixels[i] == v) << shift)
+        for i in range(n):
+            complement[i] = np.uint16(~packed[i])
+
+
+@_jit
+def _slider(words: Any, border: Any, half: Any, used: int) -> Any:
+    """All that one disc needs to slide over packed words: (words, border, offsets of disc and arcs, scratch).
+
+    half: (2R + 1,) int64, half-height of the disc at dx = -R..R. used: number of planes, at least 8.
+    """
+    stride, radius = words.shape[2], half.size // 2
+    plane = words.shape[1] * stride
+    disc = np.empty((2 * half + 1).sum(), np.int64)
+    arcs = np.empty((2 * half.size + 15) // 16 * 16, np.int64)
+    n = 0
+    for k in range(half.size):
+        dx, h = k - radius, half[k]
+        for dy in range(-h, h + 1):
+            disc[n] = dy * stride + dx
+            n += 1
+        arcs[2 * k] = h * stride + dx
+        arcs[2 * k + 1] = plane + (-1 - h) * stride + dx
+    # Filled up to whole groups with pairs of a pixel and its complement, which come to one like any other pair.
+    for k in range(half.size, arcs.size // 2):
+        arcs[2 * k], arcs[2 * k + 1] = 0, plane
+    strip = stride - 2 * border[1]
+    most = max(min(disc.size, _START_INPUTS), arcs.size)
+    planes = np.zeros((used, strip), np.uint16)
+    square = np.empty((16, strip), np.uint16)
+    carries = np.zeros(((most + 255) // 256 * 16 + 1, strip), np.uint16)
+    return words, border, disc, arcs, planes, square, carries, np.empty(16, np.uint64)
+
+
+@_jit
+def _slide(slider: Any, y: int, steps: int, row: Any) -> None:
+    """Counts of the tile's row y into row: from nothing when steps is 0, else one row on, for the steps-th time."""
+    words, border, disc, arcs, planes, square, carries, at = slider
+    stride = words.shape[2]
+    base = (y + border[0]) * stride + border[1]
+    flat = words.reshape(-1)
+    if steps > 0:
+        _add(flat, base, arcs, planes, carries, at)
+    else:
+        planes[:] = 0
+        zeros = (words.shape[1] - 1) * stride - base
+        for first in range(0, disc.size, _START_INPUTS):
+            some = disc[first : first + _START_INPUTS]
+            padded = np.full((some.size + 15) // 16 * 16, zeros)
+            padded[: some.size] = some
+            _add(flat, base, padded, planes, carries, at)
+    _emit(planes, steps * (arcs.size // 2), square, row)
+
+
+@_jit
+def _count_tile(words: Any, border: Any, half: Any, used: int, out: Any) -> None:
+    """Counts of a tile into out (h, w), a window of the whole; w may be less than the strips hold."""
+    slider = _slider(words, border, half, used)
+    row = np.empty(out.shape[1], out.dtype)
+    for y in range(out.shape[0]):
+        _slide(slider, y, y, row)
+        out[y, :] = row
+
+
+@_jit
+def _extent(mask: Any, value: int, row0: int, row1: int, col0: int, col1: int) -> Any:
+    """(row0, row1, col0, col1) of the pixels equal to value in a window of the mask; all 0 where there is none."""
+    v = np.uint8(value)
+    top, bottom, left, right = 0, 0, col1, col0
+    for y in range(row0, row1):
+        line = mask[y, col0:col1]
+        found = 0
+        for i in range(line.size):
+            found += line[i] == v
+        if found:
+            top, bottom = (top if bottom else y), y + 1
+            first, last = 0, line.size - 1
+            while line[first] != v:
+                first += 1
+            while line[last] != v:
+                last -= 1
+            left, right = min(left, col0 + first), max(right, col0 + last + 1)
+    return (top, bottom, left, right) if bottom else (0, 0, 0, 0)
+
+
+@_jit
+def _count_others(mask: Any) -> int:
+    """Number of pixels that are neither 0 nor 1 nor UNKNOWN."""
+    others = 0
+    for y in range(mask.shape[0]):
+        line = mask[y]
+        for i in range(line.size):
+            others += (line[i] > 1) & (line[i] != UNKNOWN)
+    return others
+
+
+# --- ratios ----------------------------------------------------------------------------------------------------
+
+
+@_jit
+def _clip(chord: Any, y: int, height: int, reach: Any) -> int:
+    """Chords of the disc about a pixel of row y that lie in the array: their number, and reach[x] summed over them.
+
+    chord: (2R + 1,) half-width of the disc at dy = -R..R. reach: (m,) int64, reach[x] = sum of min(chord, x), so that
+    the clipped disc of column x has number + reach[x] + reach[width - 1 - x] pixels (m - 1 being as good as more).
+    """
+    radius = chord.size // 2
+    top, bottom = min(radius, y), min(radius, height - 1 - y)
+    reach[:] = 0
+    for k in range(radius - top, radius + bottom + 1):
+        for x in range(reach.size):
+            reach[x] += min(chord[k], x)
+    return top + bottom + 1
+
+
+@_jit
+def _divide(count: Any, known: Any, out: Any) -> None:
+    """Count over known in units of 1e-4, rounded half up.
+
+    The quotient is exact in spite of the floating point: (count UNIT + known / 2) / known is a multiple of
+    1 / (2 known); a quarter of 1 / known more keeps it away from whole numbers by more than float64 can err.
+    """
+    for i in range(out.size):
+        k = np.float64(known[i])
+        ratio = (np.float64(count[i]) * UNIT + (0.5 * k + 0.25)) / max(k, 1.0)
+        out[i] = np.uint16(np.int32(ratio)) if k > 0.0 else np.uint16(NODATA)
+
+
+@_jit
+def _divide_by(count: Any, known: int, out: Any) -> None:
+    """_divide where the whole row has one known count: a product, exact for the same reason."""
+    scale, half = UNIT / np.float64(known), 0.5 + 0.25 / np.float64(known)
+    for i in range(out.size):
+        out[i] = np.uint16(np.int32(np.float64(count[i]) * scale + half))
+
+
+@_jit
+def _ratio_tile(
+    words: Any, dark: Any, dark_window: Any, border: Any, disc: Any, used: int, where: Any, out: Any, row: Any
+) -> None:
+    """Ratios of a tile into out (h, w), a window of the whole; disc is its half-heights and half-widths.
+
+    words, dark: packed building and unknown pixels; dark covers dark_window = (row0, row1, col0, col1) of the tile,
+    outside of which no disc holds an unknown pixel. where: the array's (height, width) and the tile's (row0, col0).
+    row: (w,) scratch, uint16 or uint32.
+    """
+    height, width, row0, col0 = where
+    dark0, dark1, left, right = dark_window
+    half, chord = disc
+    radius, radius_y = half.size // 2, chord.size // 2
+    slider = _slider(words, border, half, used)
+    shadow = _slider(dark, border, half, used)
+    unknown = np.zeros_like(row[left:right])
+    known = np.empty(row.size, np.int64)
+    reach = np.zeros(radius + 1, np.int64)
+    # Columns [inner0, inner1) of the tile are a radius away from the array's sides.
+    inner0 = min(max(radius - col0, 0), row.size)
+    inner1 = max(min(width - radius - col0, row.size), inner0)
+    seen = -1
+    number = 0
+    for y in range(out.shape[0]):
+        _slide(slider, y, y, row)
+        here = row0 + y
+        # Away from the array's top and bottom all rows are clipped alike.
+        alike = min(here, radius_y) + (height + 1) * min(height - 1 - here, radius_y)
+        if alike != seen:
+            seen = alike
+            number = _clip(chord, here, height, reach)
+            for i in range(row.size):
+                x = col0 + i
+                known[i] = number + reach[min(x, radius)] + reach[min(width - 1 - x, radius)]
+        target = out[y]
+        _divide(row[:inner0], known[:inner0], target[:inner0])
+        if inner1 > inner0:
+            _divide_by(row[inner0:inner1], known[inner0], target[inner0:inner1])
+        _divide(row[inner1:], known[inner1:], target[inner1:])
+        if dark0 <= y < dark1 and left < right:
+            _slide(shadow, y - dark0, y - dark0, unknown)
+            _divide(row[left:right], known[left:right] - unknown, target[left:right])
+
+
+# --- the public side -------------------------------------------------------------------------------------------
+
+
+def _radius(radius_px: float) -> float:
+    radius = float(radius_px)
+    if not (math.isfinite(radius) and 0 < radius <= 30_000):
+        raise ValueError(f"disc of radius {radius_px} px asked for: give a radius above 0 and up to 30000 px")
+    return radius
+
+
+def halo_px(radius_px: float) -> int:
+    """Border in pixels that a block needs on each side for its ratios and counts to equal the whole map's.
+
+    Raises ValueError for a radius that is not a positive finite number of pixels, or is above 30 000.
+    """
+    return math.floor(_radius(radius_px))
+
+
+def _half_heights(radius_px: float) -> NDArray[np.int64]:
+    """(2R + 1,) largest dy with dx^2 + dy^2 <= r^2 for dx = -R..R."""
+    radius = _radius(radius_px)
+    r2 = radius * radius
+    dx = np.arange(-math.floor(radius), math.floor(radius) + 1, dtype=np.int64)
+    half = np.floor(np.sqrt(np.maximum(r2 - dx * dx, 0.0))).astype(np.int64)
+    # The root may be off by one unit in its last place: let whole numbers decide.
+    half += (half + 1) ** 2 + dx * dx <= r2
+    half -= (half**2 + dx * dx > r2) & (half > 0)
+    return half
+
+
+def _disc(radius_px: float, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Half-heights for dx = -R..R, half-widths for dy = -R..R, planes needed; cut to what an array of shape can hold."""
+    whole = _half_heights(radius_px)
+    ry, rx = (min(whole.size // 2, n - 1) for n in shape)
+    middle = whole.size // 2
+    half = np.minimum(whole[middle - rx : middle + rx + 1], ry)
+    chord = np.minimum(whole[middle - ry : middle + ry + 1], rx)
+    return half, chord, max(8, int((2 * half + 1).sum()).bit_length())
+
+
+def _count_dtype(radius_px: float) -> type[np.uint16] | type[np.uint32]:
+    return np.uint16 if int((2 * _half_heights(radius_px) + 1).sum()) <= 65_535 else np.uint32
+
+
+def _contiguous(mask: NDArray[Any], what: str) -> NDArray[np.uint8]:
+    if mask.ndim != 2 or mask.size == 0 or mask.dtype not in (np.bool_, np.uint8):
+        raise ValueError(f"{what}: (rows, columns) of bool or uint8 asked for, found {mask.shape} {mask.dtype}")
+    return np.ascontiguousarray(mask).view(np.uint8)
+
+
+def _tiles(shape: tuple[int, int], rows: int, cols: int) -> list[tuple[int, int, int, int]]:
+    """(row0, row1, col0, col1) of tiles of about equal size, at most rows x cols."""
+
+    def cuts(length: int, most: int) -> list[tuple[int, int]]:
+        n = -(-length // most)
+        return [(length * k // n, length * (k + 1) // n) for k in range(n)]
+
+    return [(*r, *c) for r in cuts(shape[0], rows) for c in cuts(shape[1], cols)]
+
+
+def _packed(
+    mask: NDArray[np.uint8], value: int, tile: tuple[int, int, int, int], border: tuple[int, int]
+) -> NDArray[np.uint16]:
+    """The mask around a tile as _pack makes it."""
+    row0, row1, col0, col1 = tile
+    strip = -(-(col1 - col0) // _LANES)
+    words = np.empty((2, row1 - row0 + 2 * border[0] + 1, strip + 2 * border[1]), np.uint16)
+    _pack(mask, value, row0, col0, border, words)
+    return words
+
+
+def _each(work: Callable[[tuple[int, int, int, int]], None], tiles: list[Any], threads: int) -> None:
+    if threads < 1:
+        raise ValueError(f"{threads} threads asked for: give 1 or more")
+    if threads == 1 or len(tiles) == 1:
+        for tile in tiles:
+            work(tile)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(work, tiles):
+            pass
+
+
+def disc_counts(mask: NDArray[np.bool_] | NDArray[np.uint8], radius_px: float, *, threads: int = 1) -> _Count:
+    """Number of set pixels in the disc around every pixel.
+
+    Args:
+        mask: (H, W) bool or uint8, not 0 where set; pixels outside the array count as 0.
+        radius_px: radius in pixels, above 0; a pixel belongs to the disc when dx^2 + dy^2 <= r^2.
+        threads: number of threads to use.
+
+    Returns:
+        (H, W) uint16, or uint32 where the whole disc has more than 65 535 pixels (radius above 144).
+
+    Raises:
+        ValueError: mask of another shape or dtype, radius not in (0, 30 000], threads below 1.
+    """
+    pixels = _contiguous(mask, "disc_counts mask")
+    if mask.dtype != np.bool_:
+        pixels = (pixels != 0).view(np.uint8)
+    shape = (pixels.shape[0], pixels.shape[1])
+    half, chord, used = _disc(radius_px, shape)
+    border = (chord.size // 2, half.size // 2)
+    out = np.empty(shape, _count_dtype(radius_px))
+
+    def work(tile: tuple[int, int, int, int]) -> None:
+        row0, row1, col0, col1 = tile
+        _count_tile(_packed(pixels, 1, tile, border), border, half, used, out[row0:row1, col0:col1])
+
+    _each(work, _tiles(shape, -(-shape[0] // max(threads, 1)), _LANES * _STRIP_MAX), threads)
+    return cast(_Count, out)
+
+
+def ratio_maps_counts(
+    building: NDArray[np.uint8], radius_px: float, *, threads: int = 1
+) -> tuple[_Count, _Count]:
+    """Lossless ratios: (building pixels, known pixels) of the disc around every pixel.
+
+    Args:
+        building: (H, W) uint8: 1 building, 0 other, 255 unknown; everything outside the array is unknown.
+        radius_px: radius in pixels, above 0.
+        threads: number of threads to use.
+
+    Returns:
+        Two (H, W) arrays, dtype as in ``disc_counts``.
+
+    Raises:
+        ValueError: as ``ratio_maps``.
+    """
+    pixels = _checked(building)
+    return (
+        disc_counts(pixels == 1, radius_px, threads=threads),
+        disc_counts(pixels != UNKNOWN, radius_px, threads=threads),
+    )
+
+
+def ratio_maps(building: NDArray[np.uint8], radii_px: Sequence[float], *, threads: int = 1) -> NDArray[np.uint16]:
+    """Share of building among the known pixels of the disc around every pixel, one map a radius.
+
+    Args:
+        building: (H, W) uint8: 1 building, 0 other, 255 unknown; everything outside the array is unknown.
+        radii_px: n radii in pixels, each above 0, in any order.
+        threads: number of threads to use; the result does not depend on it.
+
+    Returns:
+        (n, H, W) uint16 in units of 1e-4, rounded half up; NODATA (65 535) where no pixel of the disc is known.
+        A block with ``halo_px(radius)`` more pixels on each side (or up to the edge of the whole) gives the whole
+        map's values.
+
+    Raises:
+        ValueError: mask of another shape, dtype or with other values, no radius or one not in (0, 30 000], threads
+            below 1.
+    """
+    pixels = _checked(building)
+    shape = (pixels.shape[0], pixels.shape[1])
+    if len(radii_px) == 0:
+        raise ValueError("ratio_maps: no radius given: give at least one, in pixels")
+    discs = [_disc(radius, shape) for radius in radii_px]
+    border = (max(d[1].size for d in discs) // 2, max(d[0].size for d in discs) // 2)
+    out = np.empty((len(discs), *shape), np.uint16)
+
+    def work(tile: tuple[int, int, int, int]) -> None:
+        row0, row1, col0, col1 = tile
+        words = _packed(pixels, 1, tile, border)
+        around = (
+            max(row0 - border[0], 0), min(row1 + border[0], shape[0]),
+            max(col0 - border[1], 0), min(col1 + border[1], shape[1]),
+        )  # fmt: skip
+        dark, window = words, (0, 0, 0, 0)
+        if some_unknown:
+            top, bottom, left, right = _extent(pixels, UNKNOWN, *around)
+            if bottom > top:
+                reached = (
+                    max(top - border[0], row0), min(bottom + border[0], row1),
+                    max(left - border[1], col0), min(right + border[1], col1),
+                )  # fmt: skip
+                dark = _packed(pixels, UNKNOWN, reached, border)
+                window = (reached[0] - row0, reached[1] - row0, reached[2] - col0, reached[3] - col0)
+        for (half, chord, used), radius, band in zip(discs, radii_px, out):
+            row = np.empty(col1 - col0, _count_dtype(radius))
+            _ratio_tile(
+                words, dark, window, border, (half, chord), used, (*shape, row0, col0),
+                band[row0:row1, col0:col1], row,
+            )  # fmt: skip
+
+    # Small tiles where something is unknown: it then touches few of them, and the others are spared the second disc.
+    some_unknown = bool((pixels == UNKNOWN).any())
+    rows, cols = (1024, 2048) if some_unknown else (shape[0], _LANES * _STRIP_MAX)
+    _each(work, _tiles(shape, min(rows, -(-shape[0] // max(threads, 1))), cols), threads)
+    return out
+
+
+def disc_radii(n: int, agl_m: float, fov_rad: float) -> NDArray[np.float64]:
+    """Radii in metres of the n discs of a view, eq. 3: r_k = (n + 1 - k) / n z tan(alpha / 2), k = 1..n.
+
+    Args:
+        n: number of discs, 1 or more.
+        agl_m: height z above ground, metres, above 0.
+        fov_rad: field of view alpha across the view's side, radians, in (0, pi).
+
+    Returns:
+        (n,) float64, largest first.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    if n < 1 or not (math.isfinite(agl_m) and agl_m > 0) or not 0 < fov_rad < math.pi:
+        raise ValueError(
+            f"{n} discs at {agl_m} m above ground and a field of view of {fov_rad} rad asked for: "
+            "give n >= 1, a height above 0 and an angle between 0 and pi"
+        )
+    k = np.arange(1, n + 1, dtype=np.float64)
+    return (n + 1 - k) / n * agl_m * math.tan(fov_rad / 2)
+
+
+def _checked(building: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if building.dtype != np.uint8:
+        raise ValueError(f"building mask: uint8 of 0, 1 and 255 asked for, found {building.dtype}")
+    pixels = _contiguous(building, "building mask")
+    others = _count_others(pixels)
+    if others:
+        raise ValueError(f"building mask: 0, 1 and 255 (unknown) asked for, found {others} pixels of other values")
+    return pixels
