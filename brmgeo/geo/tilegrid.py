@@ -25,10 +25,9 @@ from typing import ClassVar, NamedTuple
 import morecantile
 import numpy as np
 import shapely
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError as PyprojCrsError
 
 from brmgeo.errors import CrsError, SettingsError
+from brmgeo.geo.crs import transformer
 from brmgeo.geo.grid import Bounds
 
 TILE_PX = 256
@@ -295,17 +294,6 @@ def grid_named(name: str) -> TileGrid:
     if name not in grids:
         raise SettingsError(f"there is no tile grid {name!r}: give one of {', '.join(grids)}")
     return grids[name]
-
-
-@lru_cache(maxsize=64)
-def transformer(source: str, target: str) -> Transformer:
-    """A cached pyproj transformer in (x, y) order; raises CrsError where one of the names is no CRS."""
-    try:
-        return Transformer.from_crs(CRS.from_user_input(source), CRS.from_user_input(target), always_xy=True)
-    except PyprojCrsError:
-        raise CrsError(
-            f"{source!r} to {target!r}: one of them is not a coordinate reference system; write it like EPSG:5187"
-        ) from None
 
 
 @lru_cache(maxsize=32)

@@ -310,8 +310,8 @@ def ensure_tiles(
     Args:
         margin_px: tile pixels around the bounds that resampling needs.
         progress: called with (tiles done, tiles wanted) from this thread.
-        missing_ok: share of the tiles under the bounds that may be missing (never all); default: the service's own setting, 0
-            for a local source. What is missing stays unknown in the imagery.
+        missing_ok: share of the tiles under the bounds that may be missing (never all); default: the service's own
+            setting, 0 for a local source. What is missing stays unknown in the imagery.
 
     Raises MissingInputError where tiles are missing (what, where, from whom), NetworkError where a service failed,
     SettingsError where its key is not set. After a NetworkError the tiles that came are kept; the next run resumes.
