@@ -1,0 +1,74 @@
+"""The table keeps flights that were never fixed in its quantiles, and adds nothing up that should not be."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+
+import pytest
+
+from brmgeo.evaluate.scores import Scores
+from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
+
+BASE = Scores(
+    frames=40,
+    flown_m=1075.0,
+    first_fix_s=10.0,
+    first_fix_m=50.0,
+    rmse_whole_m=3.0,
+    rmse_after_first_fix_m=1.0,
+    rmse_whole_online_m=20.0,
+    false_fixes=0,
+    share_converged=0.5,
+    share_converged_after_first_fix=1.0,
+    within_sigma=(0.4, 0.9, 1.0),
+    median_after_first_fix_m=0.8,
+    worst_after_first_fix_m=2.0,
+    odometry_rmse_m=30.0,
+    odometry_rmse_after_first_fix_m=31.0,
+)
+NEVER = replace(
+    BASE,
+    first_fix_s=None,
+    first_fix_m=None,
+    rmse_after_first_fix_m=None,
+    within_sigma=None,
+    share_converged=0.0,
+)
+
+
+def rows(method: str, scores: list[Scores]) -> list[FlightRow]:
+    return [FlightRow(f"f{i}", i, method, s, 0.1 * (i + 1), 0.5) for i, s in enumerate(scores)]
+
+
+def test_a_flight_without_fix_counts_as_infinitely_late() -> None:
+    summary = summarize(rows("mask", [BASE, NEVER, NEVER]))[0]
+    assert summary.fixed == 1
+    assert summary.first_fix_median_m is None
+    assert summary.early_share == pytest.approx(1 / 3)
+    assert summary.rmse_after_median_m == 1.0
+    late = replace(BASE, first_fix_m=700.0)
+    assert summarize(rows("mask", [BASE, late, NEVER]))[0].first_fix_median_m == 700.0
+
+
+def test_methods_keep_their_order_and_their_own_figures() -> None:
+    false = replace(BASE, false_fixes=3)
+    table = summarize(rows("mask", [BASE, BASE]) + rows("paper", [false, NEVER]))
+    assert [s.method for s in table] == ["mask", "paper"]
+    assert (table[1].false_flights, table[1].false_fixes) == (1, 3)
+    assert table[0].within_2_sigma == pytest.approx(0.9)
+    assert table[0].seconds_per_frame == pytest.approx(0.15)
+
+
+def test_markdown_text_and_csv_hold_every_method_and_flight() -> None:
+    all_rows = rows("mask", [BASE, NEVER]) + rows("ratio", [BASE])
+    summaries = summarize(all_rows)
+    lines = markdown(summaries).splitlines()
+    assert len(lines) == 4
+    assert len({line.count("|") for line in lines}) == 1
+    assert "ratio" in plain(summaries).splitlines()[0]
+    read = list(csv.DictReader(io.StringIO(rows_csv(all_rows))))
+    assert [r["method"] for r in read] == ["mask", "mask", "ratio"]
+    assert read[1]["first_fix_m"] == ""
+    assert float(read[0]["within_2_sigma"]) == 0.9
