@@ -11,9 +11,11 @@ import hashlib
 import importlib.util
 import logging
 import os
+import signal
 import socket
 import sys
 import tempfile
+import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -172,7 +174,7 @@ class _Dask:
             raise WorkflowError(
                 f"the local Dask cluster does not start ({error}); run with SCHEDULER=serial, see {log}"
             ) from error
-        client.register_plugin(_worker_log(log))
+        client.register_plugin(_quiet_worker(log))
         where = (
             f"dashboard {cluster.dashboard_link}"
             if _has_dashboard()
@@ -246,17 +248,20 @@ def _look_around(token: str) -> tuple[bool, str]:
     return os.path.exists(token), _house()
 
 
-def _worker_log(path: Path) -> Any:
-    """A worker plugin, so that restarted workers have it too: Dask's warnings go to a file instead of the terminal."""
+def _quiet_worker(log: Path) -> Any:
+    """A worker plugin, so that restarted workers have it too: Dask's warnings go to a file instead of the terminal, and
+    Ctrl-C is for the run alone, which then ends its workers."""
     from distributed import WorkerPlugin
 
-    class WorkerLog(WorkerPlugin):  # type: ignore[misc,unused-ignore]
-        name = "brmgeo-log"
+    class QuietWorker(WorkerPlugin):  # type: ignore[misc,unused-ignore]
+        name = "brmgeo-quiet"
 
         def setup(self, worker: Any) -> None:
-            _redirect(path)
+            _redirect(log)
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    return WorkerLog()
+    return QuietWorker()
 
 
 @contextlib.contextmanager

@@ -46,6 +46,7 @@ _DISK_ERRORS = {
     errno.EROFS: "the file system is read-only: choose another place",
     errno.EACCES: "permission is denied: change the owner or mode, or choose another place",
     errno.EPERM: "the operation is not permitted: change the owner or mode, or choose another place",
+    errno.EEXIST: "a file stands where a folder is wanted: move it away or choose another place",
     errno.ENOTDIR: "a file stands where a folder is wanted: move it away or choose another place",
     errno.EIO: "the disk reports an input/output error: check the disk",
     errno.EMFILE: "too many files are open: raise the limit (ulimit -n) and run again",
