@@ -67,7 +67,9 @@ def undistort(camera: Camera, xy: FloatArray, iterations: int = 30) -> FloatArra
     here = distort(camera, ideal)
     outward = (here * ideal).sum(axis=-1) >= 0.0
     if not (np.abs(goal - here).max(initial=0.0) < 1e-8 and outward.all()):
-        raise ValueError("the distortion coefficients fold the image over itself: no ray belongs to some pixels")
+        raise ValueError(
+            "the distortion coefficients fold the image over itself: no ray belongs to some pixels"
+        )
     return ideal
 
 

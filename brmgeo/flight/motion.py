@@ -21,7 +21,7 @@ STEP_NOISE_M = 0.1
 def yaw_of(wxyz: FloatArray) -> FloatArray:
     """(...,) yaw of the body's x axis in radians, counter-clockwise, from (..., 4) unit quaternions w, x, y, z."""
     w, x, y, z = np.moveaxis(np.asarray(wxyz, dtype=np.float64), -1, 0)
-    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    return np.asarray(np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)))
 
 
 def slerp(first: FloatArray, second: FloatArray, share: FloatArray) -> FloatArray:
@@ -104,7 +104,14 @@ def motions(
     for i in range(n):
         have_yaw = bool(inside[i] and not within[i])
         step = None
-        if i and inside[i] and inside[i - 1] and not within[i] and not within[i - 1] and ended[i] == ended[i - 1]:
+        if (
+            i
+            and inside[i]
+            and inside[i - 1]
+            and not within[i]
+            and not within[i - 1]
+            and ended[i] == ended[i - 1]
+        ):
             step = xy[i] - xy[i - 1]
         sigma = step_noise_m * float(np.sqrt(max(dt[i], 0.0))) if step is not None else 0.0
         out.append(Motion(float(dt[i]), step, float(yaw[i]) if have_yaw else None, sigma, compass[i]))

@@ -22,7 +22,7 @@ from brmgeo.flight.values import View
 MAX_SAMPLES = 8
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _resample(image, scale, rot, agl, lens, bend, max_r2, reach2, top, left, gsd, samples, out, known):  # type: ignore[no-untyped-def]
     # image (h, w); rot level_from_camera; lens fx fy cx cy; bend k1 k2 p1 p2 k3; top, left: metres ahead and to
     # the left of the nadir of the view's corner. A sample counts when its ray lands inside the frame.
@@ -59,8 +59,8 @@ def _resample(image, scale, rot, agl, lens, bend, max_r2, reach2, top, left, gsd
                     v = y * fy + cy
                     if not (u >= -0.5 and v >= -0.5 and u < width - 0.5 and v < height - 0.5):
                         continue
-                    u0 = int(math.floor(u))
-                    v0 = int(math.floor(v))
+                    u0 = math.floor(u)
+                    v0 = math.floor(v)
                     du = u - u0
                     dv = v - v0
                     u1 = min(u0 + 1, width - 1)
@@ -124,7 +124,9 @@ def make_view(
     or a distortion that folds the image over itself.
     """
     if image.shape != (camera.height, camera.width):
-        raise ValueError(f"an image of {image.shape} does not fit a camera of {(camera.height, camera.width)}")
+        raise ValueError(
+            f"an image of {image.shape} does not fit a camera of {(camera.height, camera.width)}"
+        )
     if not (math.isfinite(agl_m) and agl_m > 0 and math.isfinite(gsd_m) and gsd_m > 0):
         raise ValueError(f"height {agl_m} m and GSD {gsd_m} m must be positive")
     rotation = level_from_camera(mount, roll_rad, pitch_rad)
