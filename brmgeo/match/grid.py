@@ -1,0 +1,329 @@
+"""The filter that ``ratio`` and ``mask`` share: belief on a grid, status, local track, smoother.
+
+One step: move the belief by odometry, weigh it by the view, read off the heaviest place. While mass lies outside the listed
+blocks the view is scored over the whole map, so nothing that still is possible is left out; once the belief is
+concentrated it is scored only where the belief lives. After a fix a local track (place, heading, scale) is carried along
+and corrected by measured poses; the belief goes on alone and remains the judge of whether there is a fix at all.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brmgeo.errors import FlightError
+from brmgeo.flight.values import Estimate, Motion, Status, View
+from brmgeo.match.belief import Belief, Mode
+from brmgeo.match.ground import GroundMap
+from brmgeo.match.settings import MatchSettings
+from brmgeo.match.smooth import Anchor, SmoothedPath, smooth_path
+from brmgeo.match.track import Track, wrap
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+def check_view(view: View) -> None:
+    """Raises FlightError where a view cannot be matched: shapes, values that are not finite, heights, GSD."""
+    name = f"frame {view.file!r} at {view.t_s} s"
+    if view.building.ndim != 2 or view.building.shape != view.known.shape or view.building.size == 0:
+        raise FlightError(
+            f"{name}: mask {view.building.shape} and known {view.known.shape} must be equal and not empty; rebuild the view"
+        )
+    numbers = (view.t_s, view.gsd_m, view.agl_m, view.radius_m, *view.nadir_px)
+    if not all(map(math.isfinite, numbers)) or min(view.gsd_m, view.agl_m, view.radius_m) <= 0:
+        raise FlightError(
+            f"{name}: GSD {view.gsd_m} m, height {view.agl_m} m, radius {view.radius_m} m, nadir {view.nadir_px} "
+            "must be finite and above 0; correct the flight's heights"
+        )
+    if not np.isfinite(view.building).all() or view.building.min() < 0 or view.building.max() > 1:
+        raise FlightError(f"{name}: mask values must lie in [0, 1]; rebuild the view")
+
+
+def check_motion(motion: Motion, view: View) -> None:
+    """Raises FlightError where a motion is not finite or time runs backwards."""
+    numbers = [motion.dt_s, motion.sigma_m]
+    numbers += [] if motion.step_m is None else [float(v) for v in motion.step_m]
+    numbers += [v for v in (motion.yaw_rad, motion.compass_yaw_rad) if v is not None]
+    if not all(map(math.isfinite, numbers)) or motion.dt_s < 0 or motion.sigma_m < 0:
+        raise FlightError(
+            f"frame {view.file!r} at {view.t_s} s: motion {motion} is not finite or runs backwards; correct the odometry"
+        )
+
+
+class GridMatcher(ABC):
+    """Bayes filter over place and heading; see the module. Subclasses say how well a view fits where."""
+
+    def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
+        self.ground = ground
+        self.settings = settings
+        self.cell_px = max(1, round(settings.belief.cell_m / ground.gsd_m))
+        self.cell_m = self.cell_px * ground.gsd_m
+        h, w = ground.building.shape
+        self.belief = Belief((-(-h // self.cell_px), -(-w // self.cell_px)), settings.belief)
+        self.track: Track | None = None
+        self._misses = 0
+        self._unfixed_searches = 0
+        self._since_informed_m = 0.0
+        self._views: list[View] = []
+        self._motions: list[Motion] = []
+        self._anchors: list[Anchor | None] = []
+
+    # What a method adds
+
+    @abstractmethod
+    def _look(self, view: View) -> None:
+        """Prepare for scoring one view."""
+
+    @abstractmethod
+    def _score_all(self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]) -> Callable[[int], F32 | None]:
+        """A function of the heading bin that gives ratios of all cells; asked for in order of bins."""
+
+    @abstractmethod
+    def _score_listed(self, view: View, yaw_rad: float) -> F32:
+        """(n, 16, 16) ratios of the belief's listed blocks."""
+
+    @abstractmethod
+    def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
+        """The view's pose measured near a pose with a covariance, or None where it cannot be trusted."""
+
+    @abstractmethod
+    def _bounds(self) -> tuple[float, float]:
+        """Bounds of one frame's ratio."""
+
+    def _learn(self, view: View, anchor: Anchor) -> None:
+        """Adapt to a view whose pose is well known."""
+
+    # The filter
+
+    def step(self, view: View, motion: Motion) -> Estimate:
+        """Take in one view and the motion since the one before, and say where the aircraft is.
+
+        Raises FlightError for a view or motion that is malformed (``check_view``, ``check_motion``).
+        """
+        check_view(view)
+        check_motion(motion, view)
+        started = bool(self._views)
+        self._views.append(_packed(view))
+        self._motions.append(motion)
+        self._anchors.append(None)
+        if started:
+            self._predict(motion)
+        if motion.compass_yaw_rad is not None and motion.yaw_rad is not None:
+            self._weigh_compass(motion.compass_yaw_rad - motion.yaw_rad)
+        self._look(view)
+        self._update(view, motion)
+        mode = self.belief.mode(self.settings.belief.mode_radius_m / self.cell_m)
+        return self._estimate(view, motion, mode)
+
+    def _predict(self, motion: Motion) -> None:
+        odo = self.settings.odometry
+        if motion.step_m is None:
+            self.track = None
+            radius = max(1.0, odo.max_speed_m_s * motion.dt_s / self.cell_m)
+            keep = odo.reset_keeps_heading if motion.yaw_rad is not None else 0.0
+            self.belief.predict_unknown(radius, keep)
+            return
+        step = np.asarray(motion.step_m, np.float64)
+        length = float(np.hypot(*step))
+        scale, scale_sigma = 0.0, odo.scale_sigma
+        if self.track is not None:
+            scale, scale_sigma = float(self.track.mean[3]), math.sqrt(float(self.track.covariance[3, 3]))
+        # The scale's error is the same in every step: its spread grows with distance, not with the root of it.
+        before = self._since_informed_m
+        along2 = scale_sigma**2 * ((before + length) ** 2 - before**2)
+        self._since_informed_m = before + length
+        bin_rad = 2 * math.pi / self.settings.belief.headings
+        across2 = (bin_rad * length) ** 2 / 12.0
+        own2 = odo.step_sigma_m**2 + motion.sigma_m**2 + (odo.step_sigma_share * length) ** 2
+        sigma = math.sqrt(0.5 * (along2 + across2) + own2)
+        drift2 = odo.drift_rad_per_sqrt_s**2 * motion.dt_s
+        share = 0.5 * drift2 / bin_rad**2
+        self.belief.predict(step * math.exp(scale) / self.cell_m, sigma / self.cell_m, share)
+        if self.track is not None:
+            self.track.predict(motion, odo)
+
+    def _weigh_compass(self, heading_rad: float) -> None:
+        bins = self.belief.heading_of(np.arange(self.belief.headings))
+        apart = np.angle(np.exp(1j * (bins - heading_rad)))
+        sigma = math.hypot(self.settings.odometry.compass_sigma_rad, math.pi / self.belief.headings)
+        like = np.exp(-0.5 * (apart / sigma) ** 2) + 1e-4
+        self.belief.weigh_headings(like / like.mean())
+
+    def _update(self, view: View, motion: Motion) -> None:
+        low, high = self._bounds()
+        yaw = motion.yaw_rad
+        known = self.belief.rest > 1e-3
+        # Flying where the map does not reach must not cost a search each frame.
+        if known and (self._unfixed_searches < 15 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)):
+            wanted = np.ones(self.belief.headings, np.bool_)
+            score = self._score_all(view, yaw if yaw is not None else 0.0, wanted)
+            if yaw is None and motion.step_m is not None:
+                score = self._any_heading(score)
+            gain = self.belief.search(score, low, high)
+        elif yaw is None and motion.step_m is not None:
+            gain = self._update_any_heading(view, low, high)
+        else:
+            gain = self.belief.update(self._score_listed(view, yaw if yaw is not None else 0.0), low, high)
+        self._unfixed_searches += 1
+        if gain > 2.0:
+            self._since_informed_m = 0.0
+
+    def _any_heading(self, score: Callable[[int], F32 | None]) -> Callable[[int], F32 | None]:
+        """Ratios where the body's heading is unknown but the odometry's is not: the mean over headings, for all."""
+        top = None
+        for h in range(self.belief.headings):
+            llr = score(h)
+            if llr is not None:
+                top = llr.copy() if top is None else np.logaddexp(top, llr)
+        assert top is not None
+        mean = np.asarray(top - math.log(self.belief.headings), np.float32)
+        return lambda h: mean
+
+    def _update_any_heading(self, view: View, low: float, high: float) -> float:
+        """The same at listed blocks: every place that is listed under any heading is scored under all."""
+        belief = self.belief
+        places, inverse = np.unique(belief.keys[:, 1:], axis=0, return_inverse=True)
+        n = belief.headings
+        keys = belief.keys
+        total: NDArray[np.float32] | None = None
+        try:
+            for h in range(n):
+                belief.keys = np.concatenate([np.full((len(places), 1), h), places], axis=1).astype(np.int32)
+                llr = self._score_listed(view, 0.0)
+                total = llr if total is None else np.asarray(np.logaddexp(total, llr), np.float32)
+        finally:
+            belief.keys = keys
+        if total is None:
+            return 0.0
+        return belief.update(np.ascontiguousarray((total - np.float32(math.log(n)))[inverse.ravel()]), low, high)
+
+    # From belief to estimate
+
+    def _world(self, cell: F64) -> F64:
+        """x, y of (..., 2) cell coordinates (row, col)."""
+        return np.stack(
+            [self.ground.left + cell[..., 1] * self.cell_m, self.ground.top - cell[..., 0] * self.cell_m], axis=-1
+        )
+
+    def _estimate(self, view: View, motion: Motion, mode: Mode | None) -> Estimate:
+        s = self.settings.belief
+        belief = self.belief
+        cells, mass, count = belief.heaviest(s.candidates)
+        extra = {"entropy": belief.entropy(), "off_map": belief.off, "unlisted": belief.rest, "listed_blocks": float(len(belief.keys))}
+        if mode is None:
+            h, w = self.ground.building.shape
+            g = self.ground.gsd_m
+            middle = np.array([self.ground.left + w * g / 2, self.ground.top - h * g / 2])
+            spread = np.diag([(w * g) ** 2, (h * g) ** 2]) / 12.0
+            status: Status = "lost" if belief.off > s.lost_mass else "ambiguous"
+            return Estimate(
+                view.t_s, status, middle, spread, math.nan, math.nan, 0.0, np.empty((0, 2)), np.empty(0), 0, extra
+            )
+        mean = self._world(mode.mean)
+        r, c = mode.covariance[0, 0], mode.covariance[1, 1]
+        cross = -mode.covariance[0, 1]
+        cov = np.array([[c, cross], [cross, r]]) * self.cell_m**2
+        heading, heading_sigma = mode.heading_rad, mode.heading_sigma_rad
+        sure = mode.mass > s.converged_mass
+        if sure:
+            mean, cov, heading, heading_sigma = self._follow(view, motion, mean, cov, heading, heading_sigma)
+        elif self.track is not None and mode.mass < 0.5:
+            self.track = None
+        if self.track is not None:
+            extra["scale"] = math.exp(float(self.track.mean[3]))
+        sigma = math.sqrt(float(np.trace(cov)) / 2.0)
+        if sure and sigma <= s.converged_sigma_m:
+            status = "converged"
+            self._unfixed_searches = 0
+        else:
+            status = "lost" if belief.off > s.lost_mass else "ambiguous"
+        if motion.yaw_rad is not None:
+            yaw = wrap(heading + motion.yaw_rad)
+        elif motion.step_m is None:
+            yaw = wrap(heading)
+        else:
+            yaw, heading_sigma = math.nan, math.nan
+        return Estimate(
+            view.t_s, status, mean, cov, yaw, heading_sigma, mode.mass, self._world(cells), mass, count, extra
+        )
+
+    def _follow(
+        self, view: View, motion: Motion, mean: F64, cov: F64, heading: float, heading_sigma: float
+    ) -> tuple[F64, F64, float, float]:
+        """Place and heading refined by a measured pose; the belief's own where there is none."""
+        body = motion.yaw_rad
+        odo = self.settings.odometry
+        if self.track is not None:
+            apart = self.track.mean[:2] - mean
+            spread = cov + self.track.covariance[:2, :2] + np.eye(2) * self.cell_m**2
+            if float(apart @ np.linalg.solve(spread, apart)) > 16.0:
+                # The belief is the judge: a track that left the one place it knows is wrong.
+                self.track = None
+        fresh = self.track is None
+        if self.track is None:
+            sigma_s = odo.scale_sigma
+            self.track = Track(
+                np.array([*mean, heading, 0.0]),
+                np.block(
+                    [
+                        [cov, np.zeros((2, 2))],
+                        [np.zeros((2, 2)), np.diag([heading_sigma**2, sigma_s**2])],
+                    ]
+                ),
+            )
+        track = self.track
+        turn = body if body is not None else 0.0
+        pose = np.array([*track.mean[:2], track.mean[2] + turn])
+        pose_cov = track.covariance[:3, :3].copy()
+        if body is None and motion.step_m is not None:
+            return track.mean[:2].copy(), track.covariance[:2, :2].copy(), heading, heading_sigma
+        anchor = self._measure(view, pose, pose_cov)
+        if anchor is not None:
+            d2 = track.distance2(anchor.pose, anchor.covariance, turn)
+            if d2 < 16.3 or fresh:
+                track.update(anchor.pose, anchor.covariance, turn)
+                self._misses = 0
+                self._anchors[-1] = anchor
+                self._learn(view, anchor)
+            else:
+                self._misses += 1
+                if self._misses >= 3:
+                    self.track = None
+                    self._misses = 0
+        result = (track.mean[:2].copy(), track.covariance[:2, :2].copy(), float(track.mean[2]), math.sqrt(float(track.covariance[2, 2])))
+        if motion.step_m is None and body is None:
+            self.track = None
+        return result
+
+    # After the flight
+
+    def smooth(self) -> SmoothedPath:
+        """The most likely path of the whole flight so far, also before the first fix; see ``brmgeo.match.smooth``."""
+        def register(i: int, pose: F64, covariance: F64) -> Anchor | None:
+            anchor = self._measure(_unpacked(self._views[i]), pose, covariance)
+            if anchor is None:
+                return None
+            error = anchor.pose - pose
+            error[2] = wrap(float(error[2]))
+            d2 = float(error @ np.linalg.solve(covariance + anchor.covariance, error))
+            return anchor if d2 < 16.3 else None
+
+        return smooth_path(
+            [v.t_s for v in self._views], self._motions, self._anchors, self.settings.odometry, register
+        )
+
+
+def _packed(view: View) -> View:
+    """The view in a quarter of the memory: the smoother looks at every view again."""
+    scaled = np.rint(view.building * 255).astype(np.uint8)
+    return View(view.t_s, scaled, view.known, view.gsd_m, view.nadir_px, view.agl_m, view.radius_m, view.file)  # type: ignore[arg-type]
+
+
+def _unpacked(view: View) -> View:
+    building = view.building.astype(np.float32) / np.float32(255)
+    return View(view.t_s, building, view.known, view.gsd_m, view.nadir_px, view.agl_m, view.radius_m, view.file)

@@ -1,0 +1,69 @@
+"""The default matcher: the whole building mask of a view against the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brmgeo.flight.values import View
+from brmgeo.match.grid import GridMatcher
+from brmgeo.match.ground import GroundMap
+from brmgeo.match.likelihood import MapCover, RateLearner, ViewPoints, mask_templates, view_points
+from brmgeo.match.register import Registrar
+from brmgeo.match.settings import MatchSettings
+from brmgeo.match.smooth import Anchor
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+class MaskMatcher(GridMatcher):
+    """Belief over place and heading, weighed by the mask's log-likelihood ratio; sub-cell registration after a fix."""
+
+    def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
+        super().__init__(ground, settings)
+        self._cover = MapCover(*ground.coverage(self.cell_px))
+        self._registrar = Registrar(ground)
+        self._learner = RateLearner(settings.rates)
+        self._points: ViewPoints | None = None
+
+    def _bounds(self) -> tuple[float, float]:
+        return self.settings.rates.llr_min, self.settings.rates.llr_max
+
+    def _look(self, view: View) -> None:
+        # Four patches a cell and axis keep the patches' own size out of the templates.
+        self._points = view_points(view, self.cell_m / 4.0)
+
+    def _templates(self, yaw_rad: float) -> tuple[F32, F32]:
+        assert self._points is not None
+        yaw = self.belief.heading_of(np.arange(self.belief.headings)) + yaw_rad
+        return mask_templates(self._points, yaw, self.cell_m, self._learner.rates)
+
+    def _score_all(
+        self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
+    ) -> Callable[[int], F32 | None]:
+        scores = self._cover.score_all(*self._templates(yaw_rad), wanted)
+        return lambda h: next(scores)
+
+    def _score_listed(self, view: View, yaw_rad: float) -> F32:
+        return self._cover.score_blocks(self.belief.keys, *self._templates(yaw_rad))
+
+    def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
+        sigma = math.sqrt(max(float(covariance[0, 0]), float(covariance[1, 1])))
+        turn = math.sqrt(float(covariance[2, 2]))
+        window = min(3.0 * sigma + 2.0, 40.0)
+        found = self._registrar.register(
+            view, pose, window, min(3.0 * turn + 0.01, 0.35), self._learner.rates
+        )
+        if found is None or found.edge or found.llr < 4.0:
+            return None
+        if max(found.covariance[0, 0], found.covariance[1, 1]) > 9.0:
+            return None
+        return Anchor(found.pose, found.covariance)
+
+    def _learn(self, view: View, anchor: Anchor) -> None:
+        assert self._points is not None
+        self._learner.learn(*self._registrar.counts(self._points, anchor.pose))

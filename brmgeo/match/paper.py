@@ -1,0 +1,427 @@
+"""The paper's matcher: sets of candidate pixels, as written in its eq. 4-7.
+
+One step:
+
+- **Search** (eq. 5): every map pixel with sum_k |M_k - f_k| < e1, over the n ratio maps at the frame's own radii.
+- **Heading** (eq. 4): a candidate c of the frame before, that came from b one frame earlier, flew in the direction of c - b.
+- **Motion** (eq. 6): a pixel stays a candidate when it lies in the box of half side eps about (x + d cos theta, y + d sin theta) of
+  some candidate c of the frame before, d being the odometry's distance. While there is only one earlier frame, any theta.
+- **Fix** (eq. 7): converged when every candidate lies within d_max of their mean; the mean is the position.
+- When no candidate is left the search starts again from the whole map.
+
+Where the text leaves a choice, this is what is done here:
+
+- The odometry's turn between the two steps is added to theta. The text's straight-line heading would lose every
+  candidate at a corner; where the flight goes straight both are the same.
+- The pairs (b, c) behind eq. 4 are followed one by one while that is affordable (``PaperSettings.pair_work`` box tests); with
+  more candidates than that nearly every heading occurs at nearly every candidate, and any heading is allowed. That keeps
+  more candidates, never fewer.
+- Candidates are whole pixels; a box contains a pixel when its centre lies strictly inside.
+- A pixel of the map where some ratio is unknown is no candidate, and a frame with a ratio unknown keeps all.
+- The restart takes the frame's own search result as the new first set.
+- A frame without an odometry step lets candidates move by up to the greatest speed in any direction; the pairs start anew.
+- Ratios are compared on the map's 1e-4 steps. The radii are those of the frame, rounded to the settings' radius step.
+- A position's covariance is the spread of its candidates, and at least that of the box (eps).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from brmgeo.flight.values import Estimate, Motion, Status, View
+from brmgeo.flight.view import features
+from brmgeo.maps.ratio import ratio_maps
+from brmgeo.match.grid import check_motion, check_view
+from brmgeo.match.ground import GroundMap
+from brmgeo.match.settings import MatchSettings
+from brmgeo.match.smooth import Anchor, SmoothedPath, smooth_path
+from brmgeo.match.track import wrap
+
+U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+
+@nb.njit(cache=True, parallel=True)
+def search(maps, wanted, limit, out):  # type: ignore[no-untyped-def]
+    """Mark every pixel with sum_k |maps[k] - wanted[k]| < limit; returns how many.
+
+    maps: (n, H, W) uint16 ratios x 1e-4, 65535 unknown; wanted: (n,) float32 in the same unit; out: (H, W) uint8.
+    """
+    n, rows, cols = maps.shape
+    counts = np.zeros(rows, np.int64)
+    for i in nb.prange(rows):
+        line = np.zeros(cols, np.float32)
+        for k in range(n):
+            source = maps[k, i]
+            f = wanted[k]
+            for j in range(cols):
+                v = source[j]
+                line[j] += abs(np.float32(v) - f) if v != 65535 else np.float32(1e9)
+        total = 0
+        for j in range(cols):
+            hit = line[j] < limit
+            out[i, j] = hit
+            total += hit
+        counts[i] = total
+    return counts.sum()
+
+
+@nb.njit(cache=True)
+def _runs(mask, row, starts, ends):  # type: ignore[no-untyped-def]
+    """Runs [start, end) of set pixels in a row; returns how many."""
+    n = 0
+    cols = mask.shape[1]
+    j = 0
+    while j < cols:
+        if mask[row, j]:
+            starts[n] = j
+            while j < cols and mask[row, j]:
+                j += 1
+            ends[n] = j
+            n += 1
+        else:
+            j += 1
+    return n
+
+
+@nb.njit(cache=True, parallel=True)
+def _gather_ring(mask, spans, reach, bands, out):  # type: ignore[no-untyped-def]
+    """Keep in ``out`` only the pixels p with p - q in the ring for some set q of ``mask``.
+
+    spans: (2 reach + 1, 4) int64, column offsets [a, b) and [c, d) that the ring covers in each row offset; a >= b: none.
+    Works on difference rows: each run of the mask adds one span of reached pixels per part of the ring. Bands of rows run
+    in parallel.
+    """
+    rows, cols = mask.shape
+    starts_all = np.empty((rows, cols // 2 + 1), np.int32)
+    ends_all = np.empty((rows, cols // 2 + 1), np.int32)
+    counts = np.zeros(rows, np.int64)
+    for i in nb.prange(rows):
+        counts[i] = _runs(mask, i, starts_all[i], ends_all[i])
+    left = np.zeros(rows, np.int64)
+    for band in nb.prange(bands):
+        diff = np.zeros(cols + 1, np.int32)
+        for i in range(rows * band // bands, rows * (band + 1) // bands):
+            some = False
+            for j in range(cols):
+                if out[i, j]:
+                    some = True
+                    break
+            if not some:
+                continue
+            diff[:] = 0
+            for t in range(2 * reach + 1):
+                q = i - (t - reach)
+                if q < 0 or q >= rows:
+                    continue
+                for part in range(2):
+                    lo, hi = spans[t, 2 * part], spans[t, 2 * part + 1]
+                    if lo >= hi:
+                        continue
+                    for r in range(counts[q]):
+                        a = max(0, starts_all[q, r] + lo)
+                        b = min(cols, ends_all[q, r] - 1 + hi)
+                        if a < b:
+                            diff[a] += 1
+                            diff[b] -= 1
+            depth = 0
+            kept = 0
+            for j in range(cols):
+                depth += diff[j]
+                if depth == 0:
+                    out[i, j] = 0
+                kept += out[i, j]
+            left[i] = kept
+    return left.sum()
+
+
+def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple[NDArray[np.int64], int]:
+    """Row by row, the whole-pixel offsets that some heading allows: the union of boxes about a circle.
+
+    A pixel offset (dx, dy) belongs when |dx - d cos t| < eps and |dy - d sin t| < eps for some t. With ``inner`` 0 the whole
+    disc of ``distance`` and its boxes belong (used where only the speed bounds the movement).
+
+    Returns (2 reach + 1, 4) int64 spans [a, b) and [c, d) per row offset -reach..reach (an empty one has a >= b), and reach.
+    """
+    reach = math.ceil(distance + eps) + 1
+    spans = np.zeros((2 * reach + 1, 4), np.int64)
+    for t in range(2 * reach + 1):
+        dy = float(t - reach)
+        # sin t must lie within (dy - eps, dy + eps) / d.
+        low, high = max(dy - eps, -distance), min(dy + eps, distance)
+        if low > high or (low == high and abs(dy - low) >= eps):
+            continue
+        nearest = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
+        farthest = max(abs(low), abs(high))
+        most = math.sqrt(max(distance**2 - nearest**2, 0.0))
+        least = math.sqrt(max(distance**2 - farthest**2, 0.0)) if inner is None else 0.0
+        # Offsets dx with |dx - c| < eps for some c in [least, most] (and mirrored): open intervals.
+        a, b = math.floor(least - eps) + 1, math.ceil(most + eps)
+        if a <= -a + 1:
+            spans[t, 0], spans[t, 1] = -b + 1, b
+        else:
+            spans[t] = (a, b, -b + 1, -a + 1)
+    return spans, reach
+
+
+@nb.njit(cache=True)
+def _follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distance, eps, limit, pairs):  # type: ignore[no-untyped-def]
+    """Pairs (new, previous) that eq. 4 and 6 allow.
+
+    New candidates by row (cols_at sorted within row_start[i]:row_start[i + 1]); previous ones (m, 2) row, col with
+    directions theta[theta_start[p]:theta_start[p + 1]]. Returns the number of pairs, or -1 when ``pairs`` is too small.
+    """
+    rows = row_start.shape[0] - 1
+    n = 0
+    for p in range(prev.shape[0]):
+        r, c = prev[p, 0], prev[p, 1]
+        first = n
+        for a in range(theta_start[p], theta_start[p + 1]):
+            x = c + distance * math.cos(theta[a])
+            y = r - distance * math.sin(theta[a])
+            for i in range(max(0, int(math.floor(y - eps)) + 1), min(rows - 1, int(math.ceil(y + eps)) - 1) + 1):
+                lo, hi = row_start[i], row_start[i + 1]
+                end = hi
+                # First candidate of the row right of the box's left side.
+                while lo < hi:
+                    mid = (lo + hi) // 2
+                    if cols_at[mid] <= x - eps:
+                        lo = mid + 1
+                    else:
+                        hi = mid
+                while lo < end and cols_at[lo] < x + eps:
+                    known = False
+                    for q in range(first, n):
+                        if pairs[q, 0] == lo:
+                            known = True
+                            break
+                    if not known:
+                        if n >= limit:
+                            return -1
+                        pairs[n, 0] = lo
+                        pairs[n, 1] = p
+                        n += 1
+                    lo += 1
+    return n
+
+
+class PaperMatcher:
+    """Candidate sets; see the module.
+
+    The estimate's mean is the mean of all candidates, whatever the status; ``ambiguous`` while several places are left, ``lost``
+    when a frame fits nowhere on the map.
+    """
+
+    def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
+        self.ground = ground
+        self.settings = settings
+        shape = ground.building.shape
+        self._maps: OrderedDict[int, NDArray[np.uint16]] = OrderedDict()
+        self._now = np.zeros(shape, np.uint8)
+        self._before = np.zeros(shape, np.uint8)
+        self._have = False
+        self._count = 0
+        # Pairs behind eq. 4: candidates (m, 2) and the directions in which each arrived, odometry frame of the last step.
+        self._places: I32 | None = None
+        self._theta_start = np.zeros(1, np.int64)
+        self._theta = np.empty(0)
+        self._last_step: F64 | None = None
+        self._pairs = np.empty((2_000_000, 2), np.int32)
+        self._times: list[float] = []
+        self._motions: list[Motion] = []
+        self._anchors: list[Anchor | None] = []
+
+    def _ratios(self, radii_m: F64) -> NDArray[np.uint16]:
+        """(n, H, W) ratio maps for the frame's radii, rounded to the ladder; the last few steps are kept."""
+        step = math.log1p(self.settings.ratio.radius_step)
+        key = round(math.log(float(radii_m[0])) / step)
+        if key not in self._maps:
+            factor = math.exp(key * step) / float(radii_m[0])
+            radii = [float(r) * factor / self.ground.gsd_m for r in radii_m]
+            self._maps[key] = ratio_maps(self.ground.building, radii, threads=2)
+            while len(self._maps) > 4:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end(key)
+        return self._maps[key]
+
+    def step(self, view: View, motion: Motion) -> Estimate:
+        """Take in one view and the motion since the one before; see the module.
+
+        Raises FlightError for a view or motion that is malformed.
+        """
+        check_view(view)
+        check_motion(motion, view)
+        s = self.settings.paper
+        self._times.append(view.t_s)
+        self._motions.append(motion)
+        f = features(view, s.radii)
+        restarted = False
+        if np.isfinite(f.f).all():
+            wanted = (f.f * 1e4).astype(np.float32)
+            found = search(self._ratios(f.radii_m), wanted, np.float32(s.e1 * 1e4), self._now)
+        else:
+            self._now[:] = 1
+            found = self._now.size
+        searched = found
+        if self._have and found:
+            kept = self._constrain(motion)
+            if kept == 0:
+                # None left: start again from this frame's own search.
+                restarted = True
+                self._places = None
+                found = search(self._ratios(f.radii_m), wanted, np.float32(s.e1 * 1e4), self._now) if np.isfinite(f.f).all() else found
+            else:
+                found = kept
+        elif not found:
+            self._places = None
+        self._count = int(found)
+        self._have = found > 0
+        self._last_step = None if motion.step_m is None else np.asarray(motion.step_m, np.float64)
+        self._before, self._now = self._now, self._before
+        return self._estimate(view, motion, int(searched), restarted)
+
+    def _constrain(self, motion: Motion) -> int:
+        """Keep of ``_now`` what the motion allows from ``_before``; returns how many are left."""
+        g = self.ground.gsd_m
+        s = self.settings.paper
+        eps = s.eps_m / g
+        if motion.step_m is None:
+            self._places = None
+            far = self.settings.odometry.max_speed_m_s * motion.dt_s / g
+            if far > max(self._now.shape):
+                return int(np.count_nonzero(self._now))
+            spans, reach = ring_spans(far, eps, inner=0.0)
+            return int(_gather_ring(self._before, spans, reach, 2 * nb.get_num_threads(), self._now))
+        distance = float(np.hypot(*motion.step_m)) / g
+        if self._places is not None and self._last_step is not None:
+            kept = self._follow(motion, distance, eps)
+            if kept >= 0:
+                return kept
+        spans, reach = ring_spans(distance, eps)
+        kept = int(_gather_ring(self._before, spans, reach, 2 * nb.get_num_threads(), self._now))
+        self._begin_pairs(distance, eps)
+        return kept
+
+    def _listed(self) -> tuple[I32, NDArray[np.int64]]:
+        """(n, 2) row, col of ``_now`` in row order, and where each row starts."""
+        flat = np.flatnonzero(self._now)
+        places = np.stack(np.divmod(flat, self._now.shape[1]), axis=1).astype(np.int32)
+        start = np.searchsorted(places[:, 0], np.arange(self._now.shape[0] + 1)).astype(np.int64)
+        return places, start
+
+    def _begin_pairs(self, distance: float, eps: float) -> None:
+        """Pairs of ``_before`` and ``_now`` under any heading, when they are few enough."""
+        self._places = None
+        n, m = int(np.count_nonzero(self._now)), int(np.count_nonzero(self._before))
+        if n == 0 or n * m > self.settings.paper.pair_work:
+            return
+        places, _ = self._listed()
+        before = np.stack(np.nonzero(self._before), axis=1)
+        chunks, starts = [], [0]
+        for place in places:
+            dx = place[1] - before[:, 1].astype(np.float64)
+            dy = before[:, 0].astype(np.float64) - place[0]
+            theta = np.arctan2(dy, dx)
+            near = (np.abs(dx - distance * np.cos(theta)) < eps) & (np.abs(dy - distance * np.sin(theta)) < eps)
+            chunks.append(theta[near])
+            starts.append(starts[-1] + int(near.sum()))
+            if starts[-1] > len(self._pairs):
+                return
+        self._places, self._theta, self._theta_start = places, np.concatenate(chunks), np.array(starts)
+
+    def _follow(self, motion: Motion, distance: float, eps: float) -> int:
+        """Eq. 4 and 6 pair by pair; -1 when there are too many pairs."""
+        assert self._places is not None and self._last_step is not None and motion.step_m is not None
+        if len(self._theta) * (2 * eps) > self.settings.paper.pair_work:
+            self._places = None
+            return -1
+        step = np.asarray(motion.step_m, np.float64)
+        turn = 0.0
+        if np.hypot(*step) > 0 and np.hypot(*self._last_step) > 0:
+            turn = math.atan2(step[1], step[0]) - math.atan2(self._last_step[1], self._last_step[0])
+        places, start = self._listed()
+        n = _follow_pairs(
+            places[:, 0], places[:, 1], start, self._places, self._theta_start, self._theta + turn, distance, eps,
+            len(self._pairs), self._pairs,
+        )  # fmt: skip
+        if n < 0:
+            self._places = None
+            return -1
+        pairs = self._pairs[:n]
+        order = np.argsort(pairs[:, 0], kind="stable")
+        new, old = pairs[order, 0], pairs[order, 1]
+        unique, starts = np.unique(new, return_index=True)
+        dx = places[new, 1].astype(np.float64) - self._places[old, 1]
+        dy = self._places[old, 0].astype(np.float64) - places[new, 0]
+        self._now[:] = 0
+        kept = places[unique]
+        self._now[kept[:, 0], kept[:, 1]] = 1
+        self._places, self._theta = kept, np.arctan2(dy, dx)
+        self._theta_start = np.append(starts, n).astype(np.int64)
+        return len(kept)
+
+    def _estimate(self, view: View, motion: Motion, searched: int, restarted: bool) -> Estimate:
+        s = self.settings.paper
+        g = self.ground.gsd_m
+        extra = {"searched": float(searched), "restarted": float(restarted)}
+        rows, cols = self.ground.building.shape
+        if not self._have:
+            middle = np.array([self.ground.left + cols * g / 2, self.ground.top - rows * g / 2])
+            spread = np.diag([(cols * g) ** 2, (rows * g) ** 2]) / 12.0
+            self._anchors.append(None)
+            return Estimate(
+                view.t_s, "lost", middle, spread, math.nan, math.nan, 0.0, np.empty((0, 2)), np.empty(0), 0, extra
+            )
+        by_row, by_col = np.count_nonzero(self._before, axis=1), np.count_nonzero(self._before, axis=0)
+        y = self.ground.top - (np.arange(rows) + 0.5) * g
+        x = self.ground.left + (np.arange(cols) + 0.5) * g
+        mean = np.array([by_col @ x, by_row @ y]) / self._count
+        var = np.array([by_col @ (x - mean[0]) ** 2, by_row @ (y - mean[1]) ** 2]) / self._count
+        # Far candidates along one axis alone already forbid convergence; the distance is checked only if they do not.
+        r, c = np.flatnonzero(by_row), np.flatnonzero(by_col)
+        half = max(abs(y[r[0]] - mean[1]), abs(y[r[-1]] - mean[1]), abs(x[c[0]] - mean[0]), abs(x[c[-1]] - mean[0]))
+        flat = np.flatnonzero(self._before)
+        status: Status = "ambiguous"
+        if half <= s.d_max_m:
+            i, j = np.divmod(flat, cols)
+            if float(np.hypot(x[j] - mean[0], y[i] - mean[1]).max()) <= s.d_max_m:
+                status = "converged"
+        most = self.settings.belief.candidates
+        if len(flat) > most:
+            flat = flat[np.linspace(0, len(flat) - 1, most).astype(np.int64)]
+        i, j = np.divmod(flat, cols)
+        candidates = np.stack([x[j], y[i]], axis=1)
+        cov = np.diag(np.maximum(var, s.eps_m**2 / 3.0))
+        heading, heading_sigma = self._heading(motion)
+        anchor = None
+        if status == "converged":
+            anchor = Anchor(np.array([*mean, 0.0]), np.diag([cov[0, 0], cov[1, 1], math.pi**2]))
+        self._anchors.append(anchor)
+        return Estimate(
+            view.t_s, status, mean, cov, heading, heading_sigma, 1.0 if status == "converged" else 1.0 / self._count,
+            candidates, np.full(len(candidates), 1.0 / self._count), self._count, extra,
+        )  # fmt: skip
+
+    def _heading(self, motion: Motion) -> tuple[float, float]:
+        """Yaw of the body in the map and its spread, from the directions in which the candidates arrived."""
+        if self._places is None or not len(self._theta) or motion.step_m is None or motion.yaw_rad is None:
+            return math.nan, math.nan
+        total = complex(np.exp(1j * self._theta).mean())
+        if abs(total) < 1e-6:
+            return math.nan, math.nan
+        course = math.atan2(float(motion.step_m[1]), float(motion.step_m[0]))
+        sigma = math.sqrt(max(-2.0 * math.log(abs(total)), 1e-4))
+        return wrap(math.atan2(total.imag, total.real) - course + motion.yaw_rad), sigma
+
+    def smooth(self) -> SmoothedPath:
+        """The path through all fixes by odometry; the paper itself has no smoother."""
+        # A set's mean says nothing of the yaw: the heading comes from the fixes' places.
+        motions = [Motion(m.dt_s, m.step_m, None, m.sigma_m) for m in self._motions]
+        path = smooth_path(self._times, motions, self._anchors, self.settings.odometry)
+        return path

@@ -1,0 +1,198 @@
+"""Settings of the matchers, with units and ranges: frozen, checked once, the same for live use and for a folder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from brmgeo.errors import SettingsError
+
+
+def _check(owner: Any, **ranges: tuple[float, float]) -> None:
+    for name, (low, high) in ranges.items():
+        value = getattr(owner, name)
+        if not (math.isfinite(value) and low <= value <= high):
+            kind = type(owner).__name__
+            raise SettingsError(f"{kind}.{name} = {value!r} is outside [{low}, {high}]: choose a value inside")
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySettings:
+    """How far odometry may be trusted; the same numbers serve belief, track and smoother.
+
+    Attributes:
+        scale_sigma: standard deviation of the scale (true step = exp(s) * step), share, [0, 0.5].
+        scale_walk_per_sqrt_s: random walk of the scale, share per root second, [0, 0.1].
+        drift_rad_per_sqrt_s: random walk of the odometry frame's heading, radians per root second, [0, 0.1]
+            (0.75 degrees per root minute is 0.0017).
+        step_sigma_m: noise of a step per axis that does not depend on its length, metres, [0, 100].
+        step_sigma_share: noise of a step per axis as a share of its length, [0, 1].
+        max_speed_m_s: bound of the movement where odometry says nothing, metres per second, [0.1, 500].
+        compass_sigma_rad: standard deviation of a trusted compass, radians, [0.001, pi].
+        reset_keeps_heading: probability that the odometry frame's heading survives a step of None, [0, 1].
+    """
+
+    scale_sigma: float = 0.05
+    scale_walk_per_sqrt_s: float = 0.0005
+    drift_rad_per_sqrt_s: float = 0.0020
+    step_sigma_m: float = 0.15
+    step_sigma_share: float = 0.01
+    max_speed_m_s: float = 25.0
+    compass_sigma_rad: float = 0.15
+    reset_keeps_heading: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            scale_sigma=(0, 0.5),
+            scale_walk_per_sqrt_s=(0, 0.1),
+            drift_rad_per_sqrt_s=(0, 0.1),
+            step_sigma_m=(0, 100),
+            step_sigma_share=(0, 1),
+            max_speed_m_s=(0.1, 500),
+            compass_sigma_rad=(0.001, math.pi),
+            reset_keeps_heading=(0, 1),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RateSettings:
+    """How a mask and a map disagree where both look at the same ground.
+
+    Attributes:
+        hit: P1, share of mask pixels that are building over a mapped building, (0, 1).
+        false_alarm: P0, the same elsewhere, (0, hit).
+        independent_m2: ground area that carries one independent observation, square metres, [1, 1e5]: mask and map
+            differ by whole buildings, so pixels of one building count together.
+        llr_min, llr_max: bounds of one frame's log-likelihood ratio, [-50, 0] and [1, 100]: a frame may be wrong as a whole.
+        learn: whether P1, P0 and the independent area follow the frames that were registered.
+    """
+
+    hit: float = 0.85
+    false_alarm: float = 0.03
+    independent_m2: float = 300.0
+    llr_min: float = -8.0
+    llr_max: float = 25.0
+    learn: bool = True
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            hit=(0.05, 0.999),
+            false_alarm=(0.0005, 0.9),
+            independent_m2=(1, 1e5),
+            llr_min=(-50, 0),
+            llr_max=(1, 100),
+        )
+        if self.false_alarm >= self.hit:
+            raise SettingsError(
+                f"RateSettings.false_alarm = {self.false_alarm} is not below hit = {self.hit}: swap or correct them"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class BeliefSettings:
+    """The grid belief and when it counts as a fix.
+
+    Attributes:
+        cell_m: size of a cell, metres, [1, 50]; rounded to whole map pixels.
+        headings: heading bins over the full circle, [8, 720].
+        off_map_start: belief that the flight starts off the map, (0, 1).
+        leak_out, leak_in: share that leaves the map, or comes back to anywhere on it, each frame, [0, 0.5].
+        heading_leak: least share that goes to each neighbouring heading bin each frame, [0, 0.3].
+        max_blocks: bound of listed blocks (16 x 16 cells of one heading, 1 KiB each), [100, 10_000_000].
+        keep: a block is listed while its mass exceeds this share of an even spread's, (0, 1].
+        mode_radius_m: cells this close to the heaviest one belong to its mode, metres, [5, 500].
+        converged_mass: belief that one mode must hold, (0.5, 1).
+        converged_sigma_m: largest spread (root of half the trace) of a fix, metres, [0.1, 200].
+        lost_mass: off-map belief above which the status is ``lost``, (0, 1).
+        candidates: how many of the heaviest cells an estimate lists, [1, 1_000_000].
+    """
+
+    cell_m: float = 5.0
+    headings: int = 72
+    off_map_start: float = 0.5
+    leak_out: float = 1e-3
+    leak_in: float = 1e-2
+    heading_leak: float = 0.002
+    max_blocks: int = 120_000
+    keep: float = 0.05
+    mode_radius_m: float = 40.0
+    converged_mass: float = 0.99
+    converged_sigma_m: float = 15.0
+    lost_mass: float = 0.5
+    candidates: int = 2000
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            cell_m=(1, 50),
+            headings=(8, 720),
+            off_map_start=(1e-9, 1 - 1e-9),
+            leak_out=(0, 0.5),
+            leak_in=(0, 0.5),
+            heading_leak=(0, 0.3),
+            max_blocks=(100, 10_000_000),
+            keep=(1e-9, 1),
+            mode_radius_m=(5, 500),
+            converged_mass=(0.5, 1),
+            converged_sigma_m=(0.1, 200),
+            lost_mass=(0, 1),
+            candidates=(1, 1_000_000),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RatioSettings:
+    """Ratio features of the ``ratio`` matcher, and of every cache of ratio maps.
+
+    Attributes:
+        radii: number of radii, r_k = k / radii of the largest disc (eq. 3), [1, 32].
+        radius_step: ratio maps are kept per step of this relative size, [0.001, 0.2]; a frame takes the nearest, so the
+            radius is off by half a step at most.
+        noise: standard deviation of a ring's ratio that no rate explains, [0.001, 0.5].
+        dof: degrees of freedom of the Student likelihood of one ring, [1, 100].
+    """
+
+    radii: int = 8
+    radius_step: float = 0.02
+    noise: float = 0.012
+    dof: float = 5.0
+
+    def __post_init__(self) -> None:
+        _check(self, radii=(1, 32), radius_step=(0.001, 0.2), noise=(0.001, 0.5), dof=(1, 100))
+
+
+@dataclass(frozen=True, slots=True)
+class PaperSettings:
+    """The paper's constants (eq. 4-7).
+
+    Attributes:
+        radii: n, number of radii, [1, 16].
+        e1: bound of sum_k |M_k - f_k|, (0, 16].
+        eps_m: half side of the box around the predicted point, metres, [0.1, 500].
+        d_max_m: converged when every candidate lies this close to their mean, metres, [0.1, 1000].
+        pair_work: eq. 4 is applied pair by pair while that takes no more box tests than this, [0, 1e10]; above it,
+            any heading is allowed.
+    """
+
+    radii: int = 3
+    e1: float = 0.12
+    eps_m: float = 10.0
+    d_max_m: float = 25.0
+    pair_work: int = 60_000_000
+
+    def __post_init__(self) -> None:
+        _check(self, radii=(1, 16), e1=(1e-6, 16), eps_m=(0.1, 500), d_max_m=(0.1, 1000), pair_work=(0, 1e10))
+
+
+@dataclass(frozen=True, slots=True)
+class MatchSettings:
+    """All settings of the matchers; each method reads the groups it needs."""
+
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    rates: RateSettings = field(default_factory=RateSettings)
+    belief: BeliefSettings = field(default_factory=BeliefSettings)
+    ratio: RatioSettings = field(default_factory=RatioSettings)
+    paper: PaperSettings = field(default_factory=PaperSettings)
