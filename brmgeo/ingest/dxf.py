@@ -62,6 +62,7 @@ MAX_BLOCK_USES = 2
 
 _OUTLINE_TYPES = (b"LWPOLYLINE", b"POLYLINE", b"LINE", b"ARC", b"CIRCLE")
 _NAME_BYTES = 64
+_BYTES_A_VALUE = 200
 _BINARY_DXF = b"AutoCAD Binary DXF"
 
 
@@ -354,13 +355,16 @@ class _Tags:
         if not len(some):
             return out
         start, end = self.starts[rows[some]], self.ends[rows[some]]
-        if np.all(start[1:] > start[:-1]):
-            # One pass of strtod over the wanted values cut out of the file; the line ends between them separate.
-            step = np.zeros(len(self._array) + 1, dtype=np.int8)
-            step[start] += 1
-            step[np.minimum(end + 1, len(self._array))] -= 1
-            text = self._array[np.cumsum(step[:-1], dtype=np.int8).view(bool)].tobytes()
-            values = _numbers(text)
+        low, high = int(start[0]), int(end[-1])
+        if np.all(start[1:] > start[:-1]) and high - low < _BYTES_A_VALUE * len(some):
+            # Where values lie close together they are cut out of the bytes in one pass; line ends separate them.
+            step = np.zeros(high - low + 2, dtype=np.int8)
+            step[start - low] = 1
+            step[end + 1 - low] = -1
+            wanted = np.cumsum(step[: high - low], dtype=np.int8).view(np.bool_)
+            values = _numbers(
+                self.data[low:high] if wanted.all() else self._array[low:high][wanted].tobytes()
+            )
             if values is not None and len(values) == len(some) and np.isfinite(values).all():
                 out[some] = values
                 return out

@@ -283,9 +283,18 @@ def _with_courtyards(
     Rings are nested to any depth: a ring at odd depth is a courtyard, at even depth a building (in a courtyard).
     A ring that shares a stretch of wall with the one around it is not a courtyard.
     """
-    tree = shapely.STRtree(polygons)
-    outer, inner = tree.query(polygons, predicate="contains")
-    pair = (outer != inner) & (layers[outer] == layers[inner])
+    outer, inner = shapely.STRtree(polygons).query(polygons)
+    box = shapely.bounds(polygons)
+    # Boxes sort out nearly all pairs, each polygon with itself first, before GEOS must look.
+    pair = (
+        (outer != inner)
+        & (box[outer, :2] <= box[inner, :2]).all(axis=1)
+        & (box[outer, 2:] >= box[inner, 2:]).all(axis=1)
+    )
+    outer, inner = outer[pair], inner[pair]
+    pair = layers[outer] == layers[inner]
+    outer, inner = outer[pair], inner[pair]
+    pair = shapely.contains(polygons[outer], polygons[inner])
     outer, inner = outer[pair], inner[pair]
     if len(outer):
         shared = shapely.length(

@@ -1,0 +1,95 @@
+"""Footprints as a GeoPackage: layers ``footprints`` and ``sheets``, ``repairs`` on request; same values, same bytes."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import geopandas as gpd
+import numpy as np
+import pyogrio
+
+from brmgeo.errors import WorkflowError
+
+# GeoPackages carry the time of their writing; a fixed one keeps equal contents equal in bytes.
+_DATE = "2000-01-01T00:00:00Z"
+
+
+class RepairLike(Protocol):
+    """What a row of the layer ``repairs`` needs; see ``ingest.repair.Repair``."""
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def handle(self) -> str: ...
+    @property
+    def layer(self) -> str: ...
+    @property
+    def x(self) -> float: ...
+    @property
+    def y(self) -> float: ...
+    @property
+    def detail(self) -> str: ...
+    @property
+    def source(self) -> str: ...
+
+
+def write_footprints_gpkg(
+    path: str | Path,
+    footprints: gpd.GeoDataFrame,
+    sheets: gpd.GeoDataFrame,
+    repairs: Sequence[RepairLike] | None = None,
+) -> None:
+    """Writes a GeoPackage with layers ``footprints`` and ``sheets``, and ``repairs`` (points) where they are given.
+
+    Rows are written in their order; the same values give the same bytes. An existing file is replaced as a whole. Raises
+    WorkflowError when the file cannot be written.
+
+    Args:
+        path: the .gpkg file.
+        footprints, sheets: GeoDataFrames with one CRS; see ``ingest.footprints.Footprints``.
+        repairs: repairs with x, y in that CRS; those without a place are left out.
+    """
+    path = Path(path)
+    draft = path.with_name(f".{path.stem}.{os.getpid()}.gpkg")
+    layers = {"footprints": (footprints, "Polygon"), "sheets": (sheets, "Polygon")}
+    if repairs is not None:
+        layers["repairs"] = (_repair_frame(repairs, footprints.crs), "Point")
+    before = pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
+    try:
+        draft.unlink(missing_ok=True)
+        for name, (frame, kind) in layers.items():
+            pyogrio.write_dataframe(
+                frame,
+                draft,
+                layer=name,
+                driver="GPKG",
+                geometry_type=kind,
+                append=draft.exists(),
+                SPATIAL_INDEX="YES",
+            )
+        # VACUUM leaves no freed pages behind, whose old contents would differ from run to run.
+        with sqlite3.connect(draft) as database:
+            database.execute("VACUUM")
+        database.close()
+        os.replace(draft, path)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, sqlite3.Error, OSError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise WorkflowError(
+            f"{path}: the footprints cannot be written ({reason}): check space and rights"
+        ) from error
+    finally:
+        draft.unlink(missing_ok=True)
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": before})
+
+
+def _repair_frame(repairs: Sequence[RepairLike], crs: object) -> gpd.GeoDataFrame:
+    placed = [repair for repair in repairs if np.isfinite(repair.x) and np.isfinite(repair.y)]
+    names = ("kind", "source", "layer", "handle", "detail")
+    columns = {name: np.array([getattr(repair, name) for repair in placed], dtype=object) for name in names}
+    points = gpd.GeoSeries.from_xy([repair.x for repair in placed], [repair.y for repair in placed], crs=crs)
+    return gpd.GeoDataFrame(columns, geometry=points, crs=crs)

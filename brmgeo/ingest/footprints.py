@@ -1,0 +1,597 @@
+"""Building footprints from any file: read, put into the region's CRS, held against the sheet number, merged at sheet edges.
+
+``read_footprints`` takes one file (DXF sheet, NGII shapefile, GeoPackage, GeoJSON, GeoParquet, whatever GDAL reads);
+``combine`` puts several together: what two sheets both hold is kept once, and buildings that a sheet edge cut in
+two are one again.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyogrio
+import shapely
+from numpy.typing import NDArray
+
+from brmgeo.errors import CrsError, InputError, MissingInputError
+from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
+from brmgeo.geo.grid import Bounds
+from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
+from brmgeo.ingest.dxf import DEFAULT_LAYERS, KIND_OF_LAYER, MAX_DROPPED_SHARE, SNAP_M, read_dxf
+from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings, shape_keys
+
+COLUMNS = ("geometry", "layer", "kind", "floors", "handle", "source", "sheet")
+SHEET_COLUMNS = ("geometry", "sheet", "source", "outline", "footprints", "area_m2", "dropped_share")
+# Two sheets cut at one neatline round their cuts to millimetres or centimetres, each on its own.
+EDGE_TOLERANCE_M = 0.05
+# Neatlines agree with the sheet number to less than a millimetre; a wrong datum moves them by some 300 m.
+NEATLINE_TOLERANCE_M = 5.0
+
+_KINDS = {
+    "미분류": "unclassified",
+    "일반주택": "house",
+    "단독주택": "house",
+    "주택": "house",
+    "연립주택": "row-house",
+    "아파트": "apartment",
+    "공사중건물": "under-construction",
+    "무벽건물": "wall-less",
+    "온실": "greenhouse",
+    "가건물": "temporary",
+    "주택외건물": "non-residential",
+}
+_KIND_COLUMNS = ("kind", "종류")
+_FLOOR_COLUMNS = ("floors", "층수", "building:levels")
+
+
+@dataclass(slots=True)
+class Footprints:
+    """Buildings in one CRS, where they are known, and what had to be repaired.
+
+    Attributes:
+        frame: GeoDataFrame in the region's CRS with COLUMNS: ``geometry`` valid polygons; ``layer`` (DXF layer or the
+            file's layer name); ``kind`` (see dxf.KIND_OF_LAYER; "" when unknown); ``floors`` Int32, missing when unknown; ``handle``
+            (DXF handle or feature number from 1); ``source`` file name; ``sheet`` number or "".
+        sheets: GeoDataFrame with SHEET_COLUMNS, one row a file: where the file says what is built, and by what ``outline``
+            that is known: "neatline", "number" (the sheet number's cell) or "extent" (only the data's bounds).
+        repairs: every repair, x and y in the region's CRS.
+        counts: facts by name, summed over files, with ``repair_KIND`` for each kind of repair.
+    """
+
+    frame: gpd.GeoDataFrame
+    sheets: gpd.GeoDataFrame
+    repairs: list[Repair] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+def read_footprints(
+    path: str | Path,
+    crs: str | None = None,
+    *,
+    source_crs: str | None = None,
+    layer: str | None = None,
+    encoding: str | None = None,
+    layers: Sequence[str] = DEFAULT_LAYERS,
+    sheet: str | None = None,
+    kind_column: str | None = None,
+    floors_column: str | None = None,
+    snap_m: float = SNAP_M,
+    max_dropped_share: float = MAX_DROPPED_SHARE,
+) -> Footprints:
+    """Footprints of one file in ``crs``.
+
+    Args:
+        path: .dxf, .shp, .gpkg, .geojson, .parquet or another vector file.
+        crs: the region's projected CRS; None takes the file's own.
+        source_crs: the file's CRS where it does not say (a DXF never does: ``crs`` is taken), or to overrule what it says.
+        layer: layer of a file with several; None needs a file with one polygon layer.
+        encoding: of a shapefile's attributes; None takes its .cpg, else EUC-KR, as NGII's are.
+        layers: DXF layers that are buildings.
+        sheet: the sheet number; None looks for one in the names of the file and its folder.
+        kind_column, floors_column: attribute columns; None takes kind or 종류, floors or 층수 where present.
+        snap_m, max_dropped_share: see ``dxf.read_dxf``.
+
+    Vertices are transformed one by one, none added or moved. Raises MissingInputError, InputError, and CrsError for
+    coordinates that do not lie where the sheet number puts them, with the distance that it would cost (see
+    ``geo.sheets.check_extent``).
+    """
+    path = Path(path)
+    if not path.exists():
+        raise MissingInputError(f"{path}: no such file: check the path of the footprints")
+    if path.suffix.lower() in {".dxf", ".dwg"}:
+        return _from_dxf(path, crs or source_crs, source_crs, layers, sheet, snap_m, max_dropped_share)
+    return _from_vector(
+        path, crs, source_crs, layer, encoding, sheet, kind_column, floors_column, snap_m, max_dropped_share
+    )
+
+
+def combine(parts: Sequence[Footprints], tolerance_m: float = EDGE_TOLERANCE_M) -> Footprints:
+    """All footprints of several files as one: what is held twice kept once, buildings cut at sheet edges merged.
+
+    The counts gain ``duplicates_across_sheets`` and ``merged_at_edges`` (cut pieces less merged buildings). Raises
+    CrsError when the parts are in different CRSs, InputError when there are none.
+    """
+    if not parts:
+        raise InputError("no footprints were given: name at least one file")
+    crs = parts[0].frame.crs.to_wkt()
+    for part in parts[1:]:
+        if not same_crs(crs, part.frame.crs.to_wkt()):
+            found = crs_name(part.frame.crs.to_wkt())
+            raise CrsError(f"footprints are in {crs_name(crs)} and in {found}: read all into one crs")
+    frame = _joined([part.frame for part in parts])
+    sheets = _joined([part.sheets for part in parts])
+    counts: Counter[str] = Counter()
+    for part in parts:
+        counts.update(part.counts)
+    repairs = [repair for part in parts for repair in part.repairs]
+    first, twice = _across_sheets(frame)
+    repairs += twice
+    frame, merged = merge_at_edges(frame[first].reset_index(drop=True), list(sheets.geometry), tolerance_m)
+    totals = dict(counts) | {f"repair_{kind}": n for kind, n in repair_counts(repairs).items()}
+    totals |= {"footprints": len(frame), "duplicates_across_sheets": len(twice), "merged_at_edges": merged}
+    return Footprints(frame, sheets, repairs, totals)
+
+
+def merge_at_edges(
+    frame: gpd.GeoDataFrame, sheets: Sequence[shapely.Geometry], tolerance_m: float = EDGE_TOLERANCE_M
+) -> tuple[gpd.GeoDataFrame, int]:
+    """Footprints with those cut at a sheet edge made one, and by how many rows that shortened the frame.
+
+    Pieces belong together when they come from different sources, are of one kind, and run along each other, within
+    ``tolerance_m``, at a sheet edge for at least half a metre or half of the shorter cut. The first piece's attributes
+    stay. The area is the pieces' own, to within the tolerance times the length of the cut.
+
+    Args:
+        frame: with COLUMNS, in metres.
+        sheets: outlines of the sheets (neatlines or cells), same CRS.
+        tolerance_m: how far the two halves of one cut may miss each other, metres.
+    """
+    if len(frame) < 2 or not len(sheets):
+        return frame, 0
+    polygons = np.asarray(frame.geometry.values, dtype=object)
+    edges = shapely.get_parts(shapely.boundary(np.asarray(sheets, dtype=object)))
+    # Segments, not whole outlines: their boxes are thin, so that the tree finds only what lies at the edge.
+    segments = np.concatenate([_segments(edge) for edge in edges])
+    hits = shapely.STRtree(segments).query(polygons, predicate="dwithin", distance=tolerance_m)[0]
+    near = np.unique(hits)
+    if len(near) < 2:
+        return frame, 0
+    strip = shapely.union_all(
+        shapely.buffer(
+            segments[
+                np.unique(
+                    shapely.STRtree(polygons[near]).query(
+                        segments, predicate="dwithin", distance=tolerance_m
+                    )[0]
+                )
+            ],
+            2.0 * tolerance_m,
+        )
+    )
+    a, b = shapely.STRtree(polygons[near]).query(polygons[near], predicate="dwithin", distance=tolerance_m)
+    a, b = near[a[a < b]], near[b[a < b]]
+    source, kind = frame["source"].to_numpy(dtype=object), frame["kind"].to_numpy(dtype=object)
+    pair = (source[a] != source[b]) & (kind[a] == kind[b])
+    a, b = a[pair], b[pair]
+    parent = np.arange(len(frame))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = int(parent[i])
+        return i
+
+    for i, j in zip(a.tolist(), b.tolist()):
+        cut_i = shapely.intersection(polygons[i].boundary, strip).length
+        cut_j = shapely.intersection(polygons[j].boundary, strip).length
+        reach = polygons[j].buffer(tolerance_m, cap_style="flat")
+        contact = shapely.intersection(shapely.intersection(polygons[i].boundary, strip), reach).length
+        if contact >= min(0.5, 0.5 * min(cut_i, cut_j)) and contact > 4.0 * tolerance_m:
+            low, high = sorted((root(i), root(j)))
+            parent[high] = low
+    roots = np.array([root(i) for i in range(len(frame))])
+    out = polygons.copy()
+    keep = np.ones(len(frame), dtype=np.bool_)
+    for head in np.flatnonzero(np.bincount(roots, minlength=len(frame)) > 1).tolist():
+        members = np.flatnonzero(roots == head)
+        whole = _sewn(polygons[members], tolerance_m)
+        if whole is not None:
+            out[head] = whole
+            keep[members[1:]] = False
+    frame = frame.set_geometry(gpd.GeoSeries(list(out), index=frame.index, crs=frame.crs))
+    return frame[keep].reset_index(drop=True), int((~keep).sum())
+
+
+def _segments(line: shapely.Geometry) -> NDArray[np.object_]:
+    xy = shapely.get_coordinates(line)
+    return np.asarray(shapely.linestrings(np.stack([xy[:-1], xy[1:]], axis=1)), dtype=object)
+
+
+def _sewn(pieces: NDArray[np.object_], tolerance_m: float) -> shapely.Polygon | None:
+    """One polygon from pieces that meet within the tolerance, or None where they do not make one."""
+    whole = pieces[0]
+    for piece in pieces[1:]:
+        whole = shapely.union(whole, shapely.snap(piece, whole, tolerance_m))
+    if whole.geom_type != "Polygon" or not whole.is_valid:
+        # Cuts whose ends miss each other along the edge: close the crack by growing and shrinking.
+        grown = shapely.buffer(shapely.union_all(pieces), tolerance_m, join_style="mitre")
+        whole = shapely.buffer(grown, -tolerance_m, join_style="mitre")
+    length = float(shapely.length(pieces).sum())
+    right = abs(whole.area - float(shapely.area(pieces).sum())) <= tolerance_m * length
+    return whole if whole.geom_type == "Polygon" and whole.is_valid and right else None
+
+
+def _across_sheets(frame: gpd.GeoDataFrame) -> tuple[NDArray[np.bool_], list[Repair]]:
+    """Rows to keep, and a repair for each footprint that an earlier file holds already (to the centimetre)."""
+    keep = np.ones(len(frame), dtype=np.bool_)
+    repairs = []
+    seen: dict[bytes, int] = {}
+    polygons = np.asarray(frame.geometry.values, dtype=object)
+    for j, key in enumerate(shape_keys(polygons, decimals=2)):
+        i = seen.setdefault(key, j)
+        if i != j and frame["source"].iat[i] != frame["source"].iat[j]:
+            keep[j] = False
+            x, y = shapely.get_coordinates(polygons[j])[0].tolist()
+            row = frame.iloc[j]
+            detail = f"also in {frame['source'].iat[i]}; removed"
+            repairs.append(Repair("duplicate", row["handle"], row["layer"], x, y, detail, row["source"]))
+    return keep, repairs
+
+
+def _joined(frames: Sequence[gpd.GeoDataFrame]) -> gpd.GeoDataFrame:
+    filled = [frame for frame in frames if len(frame)]
+    if not filled:
+        return frames[0]
+    joined = pd.concat(filled, ignore_index=True) if len(filled) > 1 else filled[0]
+    return gpd.GeoDataFrame(joined, geometry="geometry", crs=frames[0].crs)
+
+
+def _from_dxf(
+    path: Path,
+    crs: str | None,
+    source_crs: str | None,
+    layers: Sequence[str],
+    sheet: str | None,
+    snap_m: float,
+    max_dropped_share: float,
+) -> Footprints:
+    if crs is None:
+        raise CrsError(f"{path.name}: a DXF does not say its CRS: give it, such as --crs EPSG:5187")
+    require_projected_metres(crs)
+    native = source_crs or crs
+    require_projected_metres(native)
+    read = read_dxf(path, layers, snap_m=snap_m, max_dropped_share=max_dropped_share)
+    number = sheet or sheet_number_in(path.name) or ""
+    polygons = np.asarray(read.footprints.geometry.values, dtype=object)
+    numbers = [number] if number else []
+    if read.neatline is not None:
+        check_extent(
+            read.neatline.bounds,
+            native,
+            numbers,
+            f"{path.name} (neatline)",
+            NEATLINE_TOLERANCE_M,
+            neatline=True,
+        )
+    if len(polygons):
+        left, bottom, right, top = map(float, shapely.total_bounds(polygons))
+        check_extent((left, bottom, right, top), native, numbers, path.name)
+    neatline = (
+        None if read.neatline is None else _moved(np.array([read.neatline], dtype=object), native, crs)[0]
+    )
+    rows = {
+        "layer": read.footprints["layer"].to_numpy(dtype=object),
+        "kind": read.footprints["kind"].to_numpy(dtype=object),
+        "handle": read.footprints["handle"].to_numpy(dtype=object),
+    }
+    polygons = _moved(polygons, native, crs)
+    repairs = _repairs_moved(read.repairs, native, crs)
+    return _assembled(
+        path.name, number, crs, polygons, rows, None, neatline, repairs, read.counts, read.dropped_share
+    )
+
+
+def _from_vector(
+    path: Path,
+    crs: str | None,
+    source_crs: str | None,
+    layer: str | None,
+    encoding: str | None,
+    sheet: str | None,
+    kind_column: str | None,
+    floors_column: str | None,
+    snap_m: float,
+    max_dropped_share: float,
+) -> Footprints:
+    frame = _vector_frame(path, layer, encoding)
+    native = source_crs or (frame.crs.to_wkt() if frame.crs is not None else None)
+    if native is None:
+        beside = f" (no {path.stem}.prj beside it)" if path.suffix.lower() == ".shp" else ""
+        raise CrsError(
+            f"{path.name}: the file does not say its CRS{beside}: give it, such as --crs EPSG:5187"
+        )
+    target = crs or crs_name(native)
+    require_projected_metres(target)
+    geometry = np.asarray(frame.geometry.values, dtype=object)
+    polygons, row, open_rows, other = _polygons_of(geometry, snap_m)
+    polygons = _moved(polygons, native, target)
+    name = layer or path.stem
+    handles = np.array([str(i + 1) for i in row.tolist()], dtype=object)
+    repaired = repair_rings(
+        Rings(polygons, np.full(len(row), name, dtype=object), handles), path.name, courtyards=False
+    )
+    repairs = list(repaired.repairs)
+    for i in open_rows:
+        xy = shapely.get_coordinates(geometry[i])
+        kind, detail = (
+            ("open", "a line whose ends do not meet; dropped")
+            if len(xy)
+            else ("unreadable", "empty; dropped")
+        )
+        x, y = transformer(native, target).transform(*xy[0]) if len(xy) else (math.nan, math.nan)
+        repairs.append(Repair(kind, str(i + 1), name, float(x), float(y), detail, path.name))
+    outlines = len(polygons) + len(open_rows)
+    dropped = sum(repair.kind in DROPPED_KINDS for repair in repairs)
+    share = dropped / outlines if outlines else 0.0
+    if share > max_dropped_share:
+        raise InputError(
+            f"{path.name}: {dropped} of {outlines} outlines ({share:.0%}) are not usable, {max_dropped_share:.0%} allowed: "
+            "mend the file or raise max_dropped_share"
+        )
+    number = sheet or _number_of(path)
+    if len(repaired.polygons):
+        left, bottom, right, top = map(float, shapely.total_bounds(repaired.polygons))
+        check_extent((left, bottom, right, top), target, [number] if number else [], path.name)
+        if not number and path.name.upper().startswith("N3A_"):
+            number = _cell_around((left, bottom, right, top), target)
+    from_row = row[repaired.origin]
+    kinds = _kinds(frame, kind_column, path)[from_row]
+    floors = _floors(frame, floors_column, path).iloc[from_row].array
+    columns = {
+        "layer": np.full(len(from_row), name, dtype=object),
+        "kind": kinds,
+        "handle": handles[repaired.origin],
+    }
+    counts = {"outlines": outlines, "footprints": len(from_row), "other_entities": other}
+    counts |= {f"repair_{kind}": n for kind, n in repair_counts(repairs).items()}
+    return _assembled(
+        path.name, number, target, repaired.polygons, columns, floors, None, repairs, counts, share
+    )
+
+
+def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.GeoDataFrame:
+    """The file's features with attributes; raises InputError in one line for what cannot be read."""
+    suffix = path.suffix.lower()
+    try:
+        with warnings.catch_warnings():
+            # GDAL warns of what is no harm here (missing .dbf, ring order); damage is checked below.
+            warnings.simplefilter("ignore")
+            if suffix in {".parquet", ".geoparquet"}:
+                return gpd.read_parquet(path)
+            if suffix == ".shp":
+                _check_shapefile(path)
+                if encoding is None and not path.with_suffix(".cpg").exists():
+                    encoding = "EUC-KR"
+            layer = layer or _only_layer(path)
+            with _gdal_option("SHAPE_RESTORE_SHX", "YES" if os.access(path.parent, os.W_OK) else "NO"):
+                frame = pyogrio.read_dataframe(path, layer=layer, encoding=encoding, on_invalid="ignore")
+    except InputError:
+        raise
+    except Exception as error:  # GDAL, pyarrow and geopandas raise many kinds on damaged files
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(
+            f"{path.name}: cannot be read as footprints ({reason}): check or fetch the file again"
+        ) from error
+    if not isinstance(frame, gpd.GeoDataFrame):
+        raise InputError(f"{path.name}: holds no geometry, only a table: give a file with building polygons")
+    return frame
+
+
+def _only_layer(path: Path) -> str:
+    names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
+    areas = [
+        str(name) for name, kind in pyogrio.list_layers(path) if kind is not None and "Polygon" in str(kind)
+    ]
+    if len(areas) == 1 or len(names) == 1:
+        return (areas if len(areas) == 1 else names)[0]
+    for usual in ("footprints", "buildings"):
+        if usual in areas:
+            return usual
+    if not names:
+        raise InputError(f"{path.name}: holds no layer with geometry: give a file with building polygons")
+    raise InputError(f"{path.name}: has the layers {', '.join(names)}: say which holds the buildings")
+
+
+def _check_shapefile(path: Path) -> None:
+    """The header tells the length: GDAL reads what is left of a shortened file and only warns."""
+    with path.open("rb") as file:
+        header = file.read(100)
+    if len(header) < 100 or struct.unpack(">i", header[:4])[0] != 9994:
+        raise InputError(
+            f"{path.name}: this is not a shapefile (its header is missing or wrong): fetch it again"
+        )
+    said, found = 2 * struct.unpack(">i", header[24:28])[0], path.stat().st_size
+    if found < said:
+        raise InputError(
+            f"{path.name}: the file is cut short: {found} of {said} bytes are there: fetch it again"
+        )
+
+
+class _gdal_option:  # noqa: N801 - a context manager in the style of contextlib's
+    """Sets a GDAL option within a with block and puts back what was there."""
+
+    def __init__(self, name: str, value: str) -> None:
+        self.name, self.value = name, value
+
+    def __enter__(self) -> None:
+        self.before = pyogrio.get_gdal_config_option(self.name)
+        pyogrio.set_gdal_config_options({self.name: self.value})
+
+    def __exit__(self, *_: object) -> None:
+        pyogrio.set_gdal_config_options({self.name: self.before})
+
+
+def _polygons_of(
+    geometry: NDArray[np.object_], snap_m: float
+) -> tuple[NDArray[np.object_], NDArray[np.int64], list[int], int]:
+    """Single 2D polygons, the row each came from, rows that gave none though they should, and number of points."""
+    polygons: list[shapely.Geometry] = []
+    row: list[int] = []
+    lost: list[int] = []
+    others = 0
+    flat = shapely.force_2d(geometry)
+    for i, shape in enumerate(flat):
+        if shape is None or shape.is_empty:
+            lost.append(i)
+            continue
+        for part in shapely.get_parts(shapely.get_parts(shape)):
+            if part.geom_type == "Polygon":
+                polygons.append(part)
+                row.append(i)
+            elif part.geom_type in ("LineString", "LinearRing"):
+                xy = shapely.get_coordinates(part)
+                if len(xy) >= 4 - (not part.is_closed) and np.hypot(*(xy[-1] - xy[0])) <= snap_m:
+                    polygons.append(shapely.Polygon(xy))
+                    row.append(i)
+                else:
+                    lost.append(i)
+            else:
+                others += 1
+    out = np.empty(len(polygons), dtype=object)
+    out[:] = polygons
+    return out, np.array(row, dtype=np.int64), lost, others
+
+
+def _moved(geometry: NDArray[np.object_], src: str, dst: str) -> NDArray[np.object_]:
+    """Geometries with every vertex transformed, or the same ones when the CRS is the same."""
+    if not len(geometry) or same_crs(src, dst):
+        return geometry
+    change = transformer(src, dst)
+    moved = shapely.transform(geometry, lambda xy: np.stack(change.transform(xy[:, 0], xy[:, 1]), axis=1))
+    bounds = np.asarray(shapely.total_bounds(moved))
+    if not np.isfinite(bounds).all():
+        raise CrsError(
+            f"coordinates have no place in {crs_name(dst)} when read as {crs_name(src)}: check the crs"
+        )
+    return np.asarray(moved, dtype=object)
+
+
+def _repairs_moved(repairs: Sequence[Repair], src: str, dst: str) -> list[Repair]:
+    if not repairs or same_crs(src, dst):
+        return list(repairs)
+    x, y = transformer(src, dst).transform([r.x for r in repairs], [r.y for r in repairs])
+    return [replace(r, x=float(a), y=float(b)) for r, a, b in zip(repairs, x, y)]
+
+
+def _number_of(path: Path) -> str:
+    """NGII's vector files are all called N3A_...: the number stands in their folder's name."""
+    for name in (path.name, path.parent.name):
+        number = sheet_number_in(name)
+        if number is not None and len(number) >= 7:
+            return number
+    return ""
+
+
+def _cell_around(bounds: Bounds, crs: str) -> str:
+    """The 1:5,000 sheet that holds all of an NGII vector file (they are delivered by sheet), or "" where none does."""
+    x, y = (bounds[0] + bounds[2]) / 2.0, (bounds[1] + bounds[3]) / 2.0
+    try:
+        number = sheet_at(*transformer(crs, LONLAT).transform(x, y))
+        check_extent(bounds, crs, [number], tolerance_m=1.0)
+    except (InputError, CrsError):
+        return ""
+    return number
+
+
+def _column(frame: gpd.GeoDataFrame, asked: str | None, usual: Sequence[str], path: Path) -> str | None:
+    names = {str(name).casefold(): str(name) for name in frame.columns}
+    if asked is not None:
+        if asked.casefold() not in names:
+            raise InputError(
+                f"{path.name}: has no column {asked!r}; there are {', '.join(map(str, frame.columns))}"
+            )
+        return names[asked.casefold()]
+    return next((names[name] for name in usual if name in names), None)
+
+
+def _kinds(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> NDArray[np.object_]:
+    column = _column(frame, asked, _KIND_COLUMNS, path)
+    out = np.full(len(frame), "", dtype=object)
+    if column is not None:
+        for i, value in enumerate(frame[column].tolist()):
+            text = "" if value is None or value != value else str(value).strip()
+            out[i] = _KINDS.get(text) or KIND_OF_LAYER.get(text.upper()) or text
+    return out
+
+
+def _floors(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> pd.Series[Any]:
+    column = _column(frame, asked, _FLOOR_COLUMNS, path)
+    if column is None:
+        return pd.Series([pd.NA] * len(frame), dtype="Int32")
+    numbers = pd.to_numeric(
+        frame[column].map(
+            lambda value: re.sub(r"[^\d.\-]", "", str(value)) or None if value is not None else None
+        ),
+        errors="coerce",
+    ).to_numpy(dtype=float, na_value=math.nan)
+    # NGII writes 0 where the number of floors was not surveyed.
+    known = np.isfinite(numbers) & (numbers > 0) & (numbers < 1000)
+    return pd.Series(pd.array(np.where(known, np.round(numbers), 0).astype(np.int32), dtype="Int32")).where(
+        known
+    )
+
+
+def _assembled(
+    source: str,
+    number: str,
+    crs: str,
+    polygons: NDArray[np.object_],
+    columns: dict[str, NDArray[np.object_]],
+    floors: Any,
+    neatline: shapely.Geometry | None,
+    repairs: list[Repair],
+    counts: dict[str, int],
+    dropped_share: float,
+) -> Footprints:
+    n = len(polygons)
+    frame = gpd.GeoDataFrame(
+        {
+            **columns,
+            "floors": pd.array([pd.NA] * n, dtype="Int32") if floors is None else floors,
+            "source": np.full(n, source, dtype=object),
+            "sheet": np.full(n, number, dtype=object),
+        },
+        geometry=gpd.GeoSeries(list(polygons), dtype="geometry"),
+        crs=crs,
+    )[list(COLUMNS)]
+    if neatline is not None:
+        outline, place = "neatline", neatline
+    elif number:
+        outline, place = "number", sheet_polygon(number, crs)
+    else:
+        outline, place = "extent", shapely.box(*shapely.total_bounds(polygons)) if n else shapely.Polygon()
+    sheets = gpd.GeoDataFrame(
+        {
+            "sheet": np.array([number], dtype=object),
+            "source": np.array([source], dtype=object),
+            "outline": np.array([outline], dtype=object),
+            "footprints": np.array([n], dtype=np.int64),
+            "area_m2": np.array([float(shapely.area(polygons).sum()) if n else 0.0]),
+            "dropped_share": np.array([dropped_share]),
+        },
+        geometry=gpd.GeoSeries([place], dtype="geometry"),
+        crs=crs,
+    )[list(SHEET_COLUMNS)]
+    return Footprints(frame, sheets, repairs, counts)
