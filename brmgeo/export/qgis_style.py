@@ -137,10 +137,13 @@ def marker(
     alpha: int = 255,
     outline: str = "#10141c",
     outline_mm: float = 0.2,
-    outline_style: str = "solid",
+    ahead_mm: float = 0.0,
     computed: Mapping[str, str] | None = None,
 ) -> SymbolLayer:
-    """A point's marker; ``unit`` MM for the size on screen, RenderMetersInMapUnits for metres on the ground."""
+    """A point's marker; ``unit`` MM for the size on screen, RenderMetersInMapUnits for metres on the ground.
+
+    ``ahead_mm`` shifts the marker to its own right, which turns with its angle.
+    """
     return SymbolLayer(
         "SimpleMarker",
         {
@@ -149,9 +152,11 @@ def marker(
             "size": size,
             "size_unit": unit,
             "outline_color": rgba(outline),
-            "outline_style": outline_style,
+            "outline_style": "solid",
             "outline_width": outline_mm,
             "outline_width_unit": "MM",
+            "offset": f"{ahead_mm:g},0",
+            "offset_unit": "MM",
             "horizontal_anchor_point": 1,
             "vertical_anchor_point": 1,
         },
@@ -468,6 +473,7 @@ def fix_style(colour: str) -> Style:
         6.5,
         outline="#0b2a26",
         outline_mm=0.4,
+        ahead_mm=5.0,
         # filled_arrowhead points to the right, angles turn clockwise; an unknown heading hides the arrow.
         computed={"angle": 'coalesce("heading_deg", 0) - 90', "enabled": '"heading_deg" is not null'},
     )
