@@ -226,10 +226,10 @@ def fill_block(block: Polygon, ground: Ground, rng: np.random.Generator, style: 
     shops = distance < 14 and from_centre < 0.85
     ring = block.exterior
     keep = style.density * (0.97 - 0.3 * from_centre)
-    if rng.random() < 0.1 + 0.25 * max(0.0, from_centre - 0.5):
-        plan.grounds.append(Area(block.buffer(-1.0), str(rng.choice(["grass", "gravel", "garden"])), 0.0, float(rng.normal())))
-        keep *= 0.25
-    base_kind = "concrete" if shops or rng.random() < 0.6 else "yard"
+    base_kind = "concrete" if shops or rng.random() < 0.45 else str(rng.choice(["yard", "gravel", "village"]))
+    if rng.random() < 0.05 + 0.3 * max(0.0, from_centre - 0.5):
+        base_kind = str(rng.choice(["grass", "gravel", "garden"]))
+        keep *= 0.3
     plan.grounds.append(Area(block, base_kind, 0.0, float(rng.normal())))
     rows = rng.random() < 0.16 and not shops
     depth = 0.0
@@ -370,9 +370,10 @@ def apartment_complex(zone: Polygon, frame: Frame, size: tuple[float, float], rn
             floors = int(rng.integers(12, 21)) if tall else int(rng.integers(5, 7))
             x, y = local.world(np.array([[u + length / 2, v + rng.normal(0, 2.2)]]))[0]
             slab = _slab(rng, float(x), float(y), length, depth + float(rng.normal(0, 0.3)), slab_angle + float(rng.normal(0, 0.006)))
-            u += length + float(rng.uniform(9, 18))
             if not inner.contains(slab) or rng.random() > 0.5 + 0.5 * style.density:
+                u += 5.0
                 continue
+            u += length + float(rng.uniform(9, 18))
             building = Building(slab, APARTMENT, floors, 2.85 * floors + 2.0, "apartment", _jitter(rng, tone, 3.0))
             lane_at = local.world(np.array([[u - length / 2 - 12, v - depth / 2 - 11.0]]))[0]
             park = rectangle(float(lane_at[0]), float(lane_at[1]), length + 6, 15.0, slab_angle).intersection(inner)

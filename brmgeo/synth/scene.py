@@ -60,7 +60,7 @@ class TownStyle:
 
     density: float = 1.0
     forest_share: float = 0.24
-    villages: float = 7.0
+    villages: float = 9.0
     apartments: int = 3
     greenhouse_share: float = 0.06
     orchard_share: float = 0.05

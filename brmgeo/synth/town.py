@@ -69,10 +69,13 @@ def generate_town(
     )
     fields, tracks = make_fields(ground, occupied, rng, style)
     fields = _vinyl(fields, rng, style, plan)
+    tracks = _open_tracks(tracks, shapely.union_all([ground.bank, woods, built_up, *villages]))
 
     blocked = shapely.union_all([surface, ground.bank.buffer(2.0), woods.buffer(-4.0)])
     reach = shapely.box(*domain_bounds)
-    kept = districts.settle(plan.proposals, blocked, reach, rng)
+    # Houses before sheds: an annex must not keep the next house off its plot.
+    proposals = sorted(plan.proposals, key=lambda p: p.building.polygon.area < 36.0)
+    kept = districts.settle(proposals, blocked, reach, rng)
     buildings = [p.building for p in kept]
     canopies = districts.lone_canopies(buildings, rng, min(0.85, 0.62 * style.density))
     buildings += districts.attach(canopies, buildings, blocked, reach)
@@ -110,8 +113,8 @@ def _make_zones(
     """Apartment complexes, school and works: large plots at the town's edge, placed where they fit."""
     scale = min(1.0, ground.town_radius_m / 560.0)
     wanted: list[tuple[str, float, float]] = [("school", 118.0, 128.0)]
-    wanted += [("apartments", float(rng.uniform(140, 220)), float(rng.uniform(125, 190))) for _ in range(style.apartments)]
-    wanted += [("works", float(rng.uniform(150, 250)), float(rng.uniform(95, 150))) for _ in range(2)]
+    wanted += [("apartments", float(rng.uniform(170, 260)), float(rng.uniform(140, 210))) for _ in range(style.apartments)]
+    wanted += [("works", float(rng.uniform(150, 250)), float(rng.uniform(95, 150))) for _ in range(5)]
     roads = shapely.union_all([ground.arterial.buffer(13.0), ground.cross.buffer(10.0)])
     keep_out = shapely.union_all([roads, ground.bank.buffer(12.0), woods])
     zones: list[Polygon] = []
@@ -228,6 +231,16 @@ def _vinyl(fields: list[Area], rng: np.random.Generator, style: TownStyle, plan:
     return [
         Area(f.polygon, "vinyl_ground", f.angle_rad, f.shade) if i in chosen else f for i, f in enumerate(fields)
     ]
+
+
+def _open_tracks(tracks: list[Road], closed: BaseGeometry) -> list[Road]:
+    """Farm tracks end where woods, river and settlements begin."""
+    out: list[Road] = []
+    for road in tracks:
+        for part in shapely.get_parts(road.line.difference(closed)):
+            if part.geom_type == "LineString" and part.length > 30:
+                out.append(Road(part, road.width_m, road.kind))
+    return out
 
 
 def _off_buildings(fields: list[Area], yards: BaseGeometry) -> list[Area]:
