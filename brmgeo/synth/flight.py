@@ -12,10 +12,13 @@ network does), false blobs, and wobbly edges; or pixels flipped in smooth patche
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numba as nb
@@ -27,11 +30,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from brmgeo.errors import InputError
-from brmgeo.flight.camera import border_pixels, ray_from_pixel, world_from_camera
+from brmgeo.flight.camera import border_pixels, pixel_from_point, ray_from_pixel, world_from_camera
 from brmgeo.flight.motion import motions
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Odometry, Reference
 from brmgeo.flight.values import Motion, View
 from brmgeo.flight.view import make_view
+from brmgeo.geo.crs import LONLAT, convergence_rad, transformer
 
 GRAVITY = 9.80665
 EDGE_STEP_M = 2.0
@@ -117,6 +121,12 @@ class FlightSettings:
         agl_error_m: error of the measured height: one draw a flight and as much again each frame.
         compass_error_deg: error of the compass, one draw a flight and as much again each frame; None for no compass.
         masks, odometry: their error models; odometry None flies without.
+        exposure_s: shutter time, for motion blur.
+        exposure_sigma: standard deviation of the picture's brightness from frame to frame, as a factor.
+        noise_levels: standard deviation of sensor noise at middle grey, of 255.
+        vignette: share of light lost in the corners.
+        jpeg_quality: of the written frames.
+        sun_azimuth_deg: where the light on the walls comes from, clockwise from north.
     """
 
     camera: Camera = field(default_factory=lambda: Camera.from_fov(640, 480, 43.0))
@@ -134,6 +144,12 @@ class FlightSettings:
     compass_error_deg: float | None = None
     masks: MaskErrors = field(default_factory=MaskErrors)
     odometry: OdometryErrors | None = field(default_factory=OdometryErrors)
+    exposure_s: float = 1.0 / 250.0
+    exposure_sigma: float = 0.05
+    noise_levels: float = 3.0
+    vignette: float = 0.15
+    jpeg_quality: int = 92
+    sun_azimuth_deg: float = 152.0
 
     def exact(self) -> FlightSettings:
         """The same flight with perfect instruments and masks."""
@@ -208,6 +224,40 @@ class Ground:
         return np.flatnonzero((b[:, 0] <= right) & (b[:, 2] >= left) & (b[:, 1] <= top) & (b[:, 3] >= bottom))
 
 
+@dataclass(frozen=True, slots=True)
+class Imagery:
+    """A picture of the ground from straight above: (h, w, 3) uint8 RGB, north up, its corner and metres per pixel."""
+
+    rgb: NDArray[np.uint8]
+    left: float
+    top: float
+    gsd_m: float
+
+    def crop(self, box: tuple[float, float, float, float]) -> Imagery:
+        """The part within (left, bottom, right, top), or the nearest pixel of it."""
+        rows, cols = self.rgb.shape[:2]
+        c0, c1 = ((x - self.left) / self.gsd_m for x in (box[0], box[2]))
+        r0, r1 = ((self.top - y) / self.gsd_m for y in (box[3], box[1]))
+        left, top = min(max(math.floor(c0), 0), cols - 1), min(max(math.floor(r0), 0), rows - 1)
+        right, bottom = min(max(math.ceil(c1), left + 1), cols), min(max(math.ceil(r1), top + 1), rows)
+        return Imagery(
+            self.rgb[top:bottom, left:right],
+            self.left + left * self.gsd_m,
+            self.top - top * self.gsd_m,
+            self.gsd_m,
+        )
+
+    def coarser(self, factor: int) -> Imagery:
+        """The same at ``factor`` times the metres per pixel, by averaging."""
+        rows, cols = (max(1, n // factor) for n in self.rgb.shape[:2])
+        if factor <= 1 or rows * factor > self.rgb.shape[0] or cols * factor > self.rgb.shape[1]:
+            return self
+        small = cv2.resize(
+            self.rgb[: rows * factor, : cols * factor], (cols, rows), interpolation=cv2.INTER_AREA
+        )
+        return Imagery(np.asarray(small, dtype=np.uint8), self.left, self.top, self.gsd_m * factor)
+
+
 # ---------------------------------------------------------------- paths
 
 
@@ -268,6 +318,29 @@ def random_mission(
     return np.array(points)
 
 
+def path_from_geojson(file: Path | str, crs: str) -> FloatArray:
+    """(n, 2) waypoints in ``crs`` from a GeoJSON file (longitude, latitude): its first LineString, or its Points in order.
+
+    Raises InputError when the file holds neither, or is not GeoJSON.
+    """
+    file = Path(file)
+    try:
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        features = data["features"] if data["type"] == "FeatureCollection" else [data]
+        shapes = [f["geometry"] if f["type"] == "Feature" else f for f in features]
+        lines = [g["coordinates"] for g in shapes if g["type"] == "LineString"]
+        points = [g["coordinates"] for g in shapes if g["type"] == "Point"]
+        lonlat = np.array([[float(v) for v in p[:2]] for p in (lines[0] if lines else points)])
+    except OSError as error:
+        raise InputError(f"{file}: the waypoints cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, IndexError):
+        raise InputError(f"{file}: not a GeoJSON file with a LineString or Points") from None
+    if len(lonlat) < 2 or (np.abs(lonlat) > [180.0, 90.0]).any():
+        raise InputError(f"{file}: give at least two waypoints, in longitude and latitude (RFC 7946)")
+    x, y = transformer(LONLAT, crs).transform(lonlat[:, 0], lonlat[:, 1])
+    return np.stack([x, y], axis=-1)
+
+
 def place(
     shape: FloatArray,
     ground: Ground,
@@ -295,15 +368,16 @@ def place(
 
     rng = np.random.default_rng([seed, 102])
     centred = shape - (shape.min(axis=0) + shape.max(axis=0)) / 2.0
-    best, best_share = None, -1.0
+    best: FloatArray | None = None
+    best_share = -1.0
     for _ in range(500):
         angle = rng.uniform(0.0, 2.0 * math.pi)
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        turned = centred @ turn.T
+        turned = np.asarray(centred @ turn.T, dtype=np.float64)
         room_low, room_high = low - turned.min(axis=0), high - turned.max(axis=0)
         if (room_high < room_low).any():
             continue
-        path = turned + rng.uniform(room_low, room_high)
+        path: FloatArray = turned + rng.uniform(room_low, room_high)
         along = np.asarray(shapely.get_coordinates(shapely.segmentize(shapely.LineString(path), 25.0)))
         rc = np.clip(np.floor((along - [left, bottom]) / cell).astype(int), 0, size - 1)
         shares = built[rc[:, 1], rc[:, 0]]
@@ -496,7 +570,7 @@ def odometry_of(course: Course, errors: OdometryErrors, seed: int) -> Odometry:
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _paint(
+def _paint(  # type: ignore[no-untyped-def]
     xy,
     ring_start,
     polygon_start,
@@ -511,7 +585,7 @@ def _paint(
     bend,
     max_r,
     image,
-):  # type: ignore[no-untyped-def]
+):
     # Polygons of the ground through the camera into the image, pixel-centre rule, even-odd within a polygon, later
     # ones over earlier ones. rot is world_from_camera; field (2, rows, cols) moves vertices: metres in x and y on a grid
     # of field_box (left, bottom, spacing).
@@ -654,10 +728,31 @@ class Simulator:
             image,
         )
 
+    def _pile(
+        self, pose: _Pose, chosen: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.bool_]]:
+        # Buildings as piles of outlines, far ones first and roofs last, close enough for every pixel of their walls to
+        # be met: (k,) polygons, (k,) heights, (k,) whether it is the roof.
+        x, y, agl = pose.position
+        bounds = self.ground.bounds[chosen]
+        distance = np.hypot(*((bounds[:, :2] + bounds[:, 2:]) / 2.0 - [x, y]).T)
+        far_first = np.argsort(-distance, kind="stable")
+        chosen, distance, bounds = chosen[far_first], distance[far_first], bounds[far_first]
+        # A roof as high as the camera would cover the sky.
+        tall = np.minimum(self.ground.height_m[chosen], 0.8 * agl)
+        size = np.hypot(*(bounds[:, 2:] - bounds[:, :2]).T)
+        lean_px = tall * (distance + size / 2.0) / (agl - tall) * self.settings.camera.fx / agl
+        layers = np.clip(np.ceil(lean_px / 1.5), 1, 300).astype(np.int64) * (tall > 0)
+        index = np.repeat(np.arange(len(chosen)), layers + 1)
+        order = np.arange(len(index)) - np.repeat(np.cumsum(layers + 1) - layers - 1, layers + 1)
+        at = tall[index] * order / np.maximum(layers[index], 1)
+        return chosen[index], at, order == layers[index]
+
     def mask(self, frame: int, relief: bool = False) -> NDArray[np.uint8]:
         """(height, width) uint8 mask of a frame as the network would give it: 0 other, 255 building.
 
-        With ``relief`` roofs stand where their height puts them in the picture, else where the map has them.
+        With ``relief`` roofs stand where their height puts them in the picture, and walls are no building; else outlines
+        are where the map has them.
         """
         errors = self.settings.masks
         rng = np.random.default_rng([self.seed, _MASK, frame])
@@ -679,9 +774,11 @@ class Simulator:
             own = ndtri(_hash_uniform(chosen, self.seed))
             latent = always * own + math.sqrt(1.0 - always**2) * rng.standard_normal(len(chosen))
             chosen = chosen[latent >= ndtri(errors.missed)]
-        heights = self.ground.height_m[chosen] if relief else np.zeros(len(chosen))
-        full = np.full(len(chosen), 255, dtype=np.uint8)
-        self.paint(image, pose, self.ground, chosen, full, heights, field, field_box)
+        heights, roof = np.zeros(len(chosen)), np.ones(len(chosen), dtype=np.bool_)
+        if relief:
+            chosen, heights, roof = self._pile(pose, chosen)
+        values = np.where(roof, 255, 0).astype(np.uint8)
+        self.paint(image, pose, self.ground, chosen, values, heights, field, field_box)
 
         blobs = int(rng.poisson(errors.false_blobs))
         if blobs:
@@ -691,6 +788,55 @@ class Simulator:
         if errors.pixel_accuracy is not None:
             _flip(image, 1.0 - errors.pixel_accuracy, rng)
         return image
+
+    def picture(self, frame: int, imagery: Imagery) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8 RGB: the frame as the camera takes it from ``imagery``.
+
+        Buildings with a height stand up: their roofs are moved to where the camera sees them, and walls that face the
+        camera fill the gap. Beyond the imagery its border goes on; above the horizon there is a grey sky.
+        """
+        settings = self.settings
+        rng = np.random.default_rng([self.seed, _PICTURE, frame])
+        pose = self.pose(frame)
+        height, width = settings.camera.height, settings.camera.width
+        x0, y0, agl = pose.position
+
+        # Metres above ground of what each pixel shows; walls count negative.
+        plane = np.zeros((height, width), dtype=np.float32)
+        chosen = self.ground.near(*pose.box)
+        index, at, roof = self._pile(pose, chosen[self.ground.height_m[chosen] > 0])
+        values = np.where(roof, at, -np.maximum(at, 1e-3)).astype(np.float32)
+        self.paint(plane, pose, self.ground, index, values, at)
+
+        rays = _ray_grid(settings.camera) @ pose.rotation.T.astype(np.float32)
+        down = rays[..., 2] < -1e-3
+        reach = (np.abs(plane) - np.float32(agl)) / np.where(down, rays[..., 2], np.float32(-1e-3))
+        dx, dy = rays[..., 0] * reach, rays[..., 1] * reach
+        part = imagery.crop(pose.box)
+        part = part.coarser(max(1, int(agl / settings.camera.fx / imagery.gsd_m + 0.25)))
+        # Offsets from the nadir are small numbers: float32 holds them to less than a millimetre.
+        columns = dx / np.float32(part.gsd_m) + np.float32((x0 - part.left) / part.gsd_m - 0.5)
+        rows = np.float32((part.top - y0) / part.gsd_m - 0.5) - dy / np.float32(part.gsd_m)
+        seen = cv2.remap(part.rgb, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        light = np.asarray(seen, dtype=np.float32)
+
+        wall = plane < 0
+        if wall.any():
+            light[wall] = _walls(
+                dx[wall], dy[wall], -plane[wall], float(x0), float(y0), settings.sun_azimuth_deg
+            )
+        light[~down] = (176.0, 186.0, 196.0)
+
+        row = min(int(self.course.frame_index[frame]), len(self.course.t_s) - 2)
+        light = _motion_blur(light, settings, self.course, row)
+        u = (np.arange(width, dtype=np.float32) - (width - 1) / 2) / (width / 2)
+        v = (np.arange(height, dtype=np.float32) - (height - 1) / 2) / (height / 2)
+        light *= (1.0 - settings.vignette * (u[None, :] ** 2 + v[:, None] ** 2) / 2.0)[..., None]
+        light *= np.float32(math.exp(settings.exposure_sigma * rng.standard_normal()))
+        if settings.noise_levels > 0:
+            noise = rng.standard_normal(light.shape, dtype=np.float32) * np.float32(settings.noise_levels)
+            light += noise * np.sqrt(np.maximum(light, 8.0) / 128.0)
+        return np.clip(np.rint(light), 0, 255).astype(np.uint8)
 
     def view(self, frame: int, image: NDArray[np.uint8], gsd_m: float, **options: Any) -> View:
         """The view that the localizer makes of a frame, from what the instruments say."""
@@ -707,6 +853,63 @@ class Simulator:
             file=frame_name(frame),
             **options,
         )
+
+
+@lru_cache(maxsize=4)
+def _ray_grid(camera: Camera) -> NDArray[np.float32]:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return ray_from_pixel(camera, np.stack([u, v], axis=-1)).astype(np.float32)
+
+
+def _walls(
+    dx: NDArray[np.floating[Any]],
+    dy: NDArray[np.floating[Any]],
+    z: NDArray[np.floating[Any]],
+    x0: float,
+    y0: float,
+    sun_azimuth_deg: float,
+) -> NDArray[np.float32]:
+    # (k, 3) light of wall points: lit by how far the wall, which faces the camera, also faces the sun; a storey is 3 m.
+    azimuth = math.radians(sun_azimuth_deg)
+    away = np.hypot(dx, dy) + 1e-6
+    facing = -(dx * math.sin(azimuth) + dy * math.cos(azimuth)) / away
+    shade = 0.62 + 0.3 * facing
+    along = (dx + x0 % 3000.0) * 0.8 + (dy + y0 % 3000.0) * 0.6
+    window = (
+        (np.mod(z, 3.0) > 0.9)
+        & (np.mod(z, 3.0) < 2.2)
+        & (np.mod(along, 3.0) > 0.8)
+        & (np.mod(along, 3.0) < 2.3)
+    )
+    shade = np.where(window, shade * 0.55, shade)
+    return np.asarray(shade[:, None] * np.array([206.0, 200.0, 190.0]), dtype=np.float32)
+
+
+def _motion_blur(
+    light: NDArray[np.float32], settings: FlightSettings, course: Course, row: int
+) -> NDArray[np.float32]:
+    # The picture's own movement while the shutter is open, at its centre, as a short line of light.
+    rotations = [world_from_camera(settings.mount, *course.roll_pitch_yaw[i]) for i in (row, row + 1)]
+    centre = rotations[0][:, 2]
+    if centre[2] > -0.05:
+        return light
+    point = course.xyz_m[row] + centre * (course.xyz_m[row, 2] / -centre[2])
+    before, after = (
+        pixel_from_point(settings.camera, r, course.xyz_m[row + i], point) for i, r in enumerate(rotations)
+    )
+    shift = (after - before) * (RATE_HZ * settings.exposure_s)
+    length = float(np.hypot(*shift))
+    if not 0.2 < length < 60.0:
+        return light
+    half = math.ceil(length / 2.0) + 1
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
+    for share in np.linspace(-0.5, 0.5, 8 * half + 1):
+        c, r = half + shift[0] * share, half + shift[1] * share
+        i, j = int(r), int(c)
+        a, b = r - i, c - j
+        kernel[i : i + 2, j : j + 2] += np.outer([1 - a, a], [1 - b, b])
+    blurred = cv2.filter2D(light, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(blurred, dtype=np.float32)
 
 
 def frame_name(frame: int) -> str:
@@ -798,3 +1001,168 @@ def simulate_views(
     steps = motions(track, course.frame_times_s, compass_yaw_rad=compass)
     reference = Reference(course.frame_times_s, course.xyz_m[course.frame_index, :2])
     return SimulatedViews(views, steps, reference, course.roll_pitch_yaw[course.frame_index, 2])
+
+
+# ---------------------------------------------------------------- as a folder
+
+
+def imu_of(course: Course, seed: int) -> tuple[FloatArray, FloatArray]:
+    """(m, 3) rad/s and (m, 3) m/s2 of a consumer-grade unit in the body frame along a course, at its own rate.
+
+    Noise densities 0.005 deg/s and 0.002 m/s2 per root Hz, constant biases of 0.1 deg/s and 0.02 m/s2.
+    """
+    rng = np.random.default_rng([seed, _SENSORS, 1])
+    roll, pitch, yaw = course.roll_pitch_yaw.T
+    turn = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=-1))
+    gyro = (turn[:-1].inv() * turn[1:]).as_rotvec() * RATE_HZ
+    gyro = np.concatenate([gyro, gyro[-1:]])
+    velocity = np.gradient(course.xyz_m, course.t_s, axis=0)
+    accel = np.gradient(velocity, course.t_s, axis=0)
+    accel = turn.inv().apply(accel + [0.0, 0.0, GRAVITY])
+    root = math.sqrt(RATE_HZ)
+    gyro += math.radians(0.1) * rng.normal(size=3) + math.radians(0.005) * root * rng.normal(size=gyro.shape)
+    accel += 0.02 * rng.normal(size=3) + 0.002 * root * rng.normal(size=accel.shape)
+    return gyro, accel
+
+
+def _toml(name: str, settings: FlightSettings, reference: str, altimeter: bool) -> str:
+    camera, mount = settings.camera, settings.mount
+    lens = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    lines = [f"name = {json.dumps(name)}", "[camera]", f"width = {camera.width}", f"height = {camera.height}"]
+    lines += [f"{key} = {float(value)!r}" for key, value in lens.items()]
+    if camera.is_distorted:
+        lines.append(f"distortion = [{', '.join(repr(float(v)) for v in camera.distortion)}]")
+    lines.append("[mount]")
+    for key in ("roll", "pitch", "yaw"):
+        lines.append(f"{key}_deg = {round(math.degrees(getattr(mount, key + '_rad')), 9)!r}")
+    if settings.odometry is not None:
+        lines += ["[odometry]", 'file = "odometry.tum"', 'format = "tum"']
+    lines += ["[height]", 'source = "frames"']
+    if altimeter:
+        lines += ["[altimeter]", 'file = "altimeter.csv"']
+    lines += ["[reference]", 'file = "reference.csv"', f"crs = {json.dumps(reference)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _write_rows(
+    path: Path, header: str, columns: Sequence[Any], formats: Sequence[str], separator: str = ","
+) -> None:
+    # One format call over all numbers: row by row it would be most of a masks-only flight's time.
+    table = np.column_stack(columns)
+    row = separator.join(formats) + "\n"
+    path.write_text(
+        header + (row * len(table)) % tuple(table.ravel().tolist()), encoding="utf-8", newline="\n"
+    )
+
+
+def simulate(
+    out: Path | str,
+    ground: Ground,
+    path: FloatArray,
+    crs: str,
+    settings: FlightSettings | None = None,
+    seed: int = 0,
+    *,
+    mode: Literal["masks", "frames", "both"] = "masks",
+    imagery: Imagery | None = None,
+    relief: bool | None = None,
+    lonlat: bool = False,
+    name: str | None = None,
+) -> Path:
+    """Writes the flight folder ``out`` and returns it; the same arguments give the same bytes.
+
+    Args:
+        out: a folder that is not there yet, or empty.
+        ground, path: as for ``simulate_views``, in ``crs``.
+        mode: ``masks`` writes masks/ only (no network is needed to localize the flight), ``frames`` pictures
+            rendered from ``imagery`` with imu.csv and altimeter.csv, ``both`` all of it.
+        relief: roofs stand where their height puts them; default: in pictures and the masks that go with them.
+        lonlat: write the reference as longitude and latitude, else as x, y in ``crs``.
+
+    Raises InputError when ``out`` holds files already, or pictures are wanted without imagery.
+    """
+    out = Path(out)
+    settings = settings or FlightSettings()
+    if mode != "masks" and imagery is None:
+        raise InputError(f"mode {mode!r} draws pictures and needs imagery: give some, or choose mode 'masks'")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(
+            f"{out}: a simulated flight needs a new or empty folder: remove it or choose another"
+        )
+    course = fly(path, settings, seed)
+    simulator = Simulator(ground, settings, course, seed)
+    out.mkdir(parents=True, exist_ok=True)
+    pictures, masks = mode in ("frames", "both"), mode in ("masks", "both")
+    for folder, wanted in (("frames", pictures), ("masks", masks)):
+        if wanted:
+            (out / folder).mkdir()
+    count = len(course.frame_index)
+    for i in range(count):
+        if masks:
+            image = simulator.mask(i, pictures if relief is None else relief)
+            _write_image(
+                out / "masks" / f"{Path(frame_name(i)).stem}.png", image, [cv2.IMWRITE_PNG_BILEVEL, 1]
+            )
+        if pictures:
+            assert imagery is not None
+            shown = simulator if relief is not False else replace(simulator, ground=_flat(ground))
+            _write_image(
+                out / "frames" / frame_name(i),
+                shown.picture(i, imagery)[:, :, ::-1],
+                [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality],
+            )
+
+    x, y = course.xyz_m[course.frame_index[0], :2]
+    header = "t_s,file,agl_m,roll_deg,pitch_deg"
+    columns: list[Any] = [
+        course.frame_times_s,
+        course.measured_agl_m,
+        course.measured_roll_deg,
+        course.measured_pitch_deg,
+    ]
+    formats = ["%.2f", "%.3f", "%.4f", "%.4f"]
+    if course.measured_grid_heading_deg is not None:
+        header += ",yaw_deg"
+        convergence = math.degrees(convergence_rad(crs, float(x), float(y)))
+        columns.append((course.measured_grid_heading_deg + convergence) % 360.0)
+        formats.append("%.6f")
+    rows = [[f % v for f, v in zip(formats, values)] for values in zip(*columns)]
+    lines = [",".join([row[0], frame_name(i), *row[1:]]) for i, row in enumerate(rows)]
+    (out / "frames.csv").write_text("\n".join([header, *lines]) + "\n", encoding="utf-8", newline="\n")
+
+    if settings.odometry is not None:
+        track = odometry_of(course, settings.odometry, seed)
+        xyzw = [track.wxyz[:, k] for k in (1, 2, 3, 0)]
+        values = [track.t_s, *track.xyz_m.T, *xyzw]
+        _write_rows(out / "odometry.tum", "", values, ["%.6f"] + ["%.4f"] * 3 + ["%.17g"] * 4, " ")
+    every = slice(None, None, RATE_HZ // 5)
+    t, place_xy = course.t_s[every], course.xyz_m[every, :2]
+    if lonlat:
+        lon, lat = transformer(crs, LONLAT).transform(place_xy[:, 0], place_xy[:, 1])
+        _write_rows(out / "reference.csv", "t_s,lon,lat\n", [t, lon, lat], ["%.2f", "%.9f", "%.9f"])
+    else:
+        _write_rows(out / "reference.csv", "t_s,x,y\n", [t, place_xy], ["%.2f", "%.4f", "%.4f"])
+    if pictures:
+        gyro, accel = imu_of(course, seed)
+        values = [course.t_s, gyro, accel]
+        _write_rows(
+            out / "imu.csv", "t_s,gx,gy,gz,ax,ay,az\n", values, ["%.2f"] + ["%.7f"] * 3 + ["%.6f"] * 3
+        )
+        rng = np.random.default_rng([seed, _SENSORS, 2])
+        tenth = slice(None, None, RATE_HZ // 10)
+        agl = course.xyz_m[tenth, 2]
+        agl = agl + settings.agl_error_m * (rng.normal() + rng.normal(size=len(agl)))
+        _write_rows(out / "altimeter.csv", "t_s,agl_m\n", [course.t_s[tenth], agl], ["%.2f", "%.3f"])
+    toml = _toml(name or f"simulated-{seed}", settings, LONLAT if lonlat else crs, pictures)
+    (out / "flight.toml").write_text(toml, encoding="utf-8", newline="\n")
+    return out
+
+
+def _flat(ground: Ground) -> Ground:
+    return replace(ground, height_m=np.zeros_like(ground.height_m))
+
+
+def _write_image(path: Path, image: NDArray[np.uint8], options: list[int]) -> None:
+    ok, data = cv2.imencode(path.suffix, image, options)
+    assert ok
+    path.write_bytes(data.tobytes())
