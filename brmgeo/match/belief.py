@@ -21,21 +21,23 @@ import cv2
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from brmgeo.match.settings import BeliefSettings
+from brmgeo.match.threads import split
 
 BLOCK = 16
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
-def _move(blocks, index, targets, whole, ky, kx, reach, ny, nx, out):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _move(blocks, index, targets, whole, ky, kx, reach, ny, nx, out, t0, t1):  # type: ignore[no-untyped-def]
     """Each target block gathered from its sources: whole-cell shift, then a separable kernel of 2 reach + 1 taps."""
     side = BLOCK + 2 * reach
     taps = 2 * reach + 1
     nby, nbx = index.shape[1], index.shape[2]
-    for t in nb.prange(targets.shape[0]):
+    for t in range(t0, t1):
         h, by, bx = targets[t, 0], targets[t, 1], targets[t, 2]
         top = by * BLOCK - reach - whole[h, 0]
         left = bx * BLOCK - reach - whole[h, 1]
@@ -69,11 +71,11 @@ def _move(blocks, index, targets, whole, ky, kx, reach, ny, nx, out):  # type: i
                 out[t, i, j] = 0.0
 
 
-@nb.njit(cache=True, parallel=True)
-def _mix(blocks, index, targets, share, out):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _mix(blocks, index, targets, share, out, t0, t1):  # type: ignore[no-untyped-def]
     """Each target block takes ``share`` from both neighbouring headings and keeps the rest."""
     headings = index.shape[0]
-    for t in nb.prange(targets.shape[0]):
+    for t in range(t0, t1):
         h, by, bx = targets[t, 0], targets[t, 1], targets[t, 2]
         out[t] = 0.0
         for d in range(-1, 2):
@@ -85,12 +87,12 @@ def _mix(blocks, index, targets, share, out):  # type: ignore[no-untyped-def]
                         out[t, i, j] += w * blocks[s, i, j]
 
 
-@nb.njit(cache=True, parallel=True)
+@nb.njit(cache=True, nogil=True, fastmath=True)
 def _mass_of(blocks):  # type: ignore[no-untyped-def]
     """(sum, maximum) of each block, float64."""
     out = np.empty((blocks.shape[0], 2), np.float64)
-    for t in nb.prange(blocks.shape[0]):
-        total = 0.0
+    for t in range(blocks.shape[0]):
+        total = np.float32(0.0)
         top = np.float32(0.0)
         for i in range(BLOCK):
             for j in range(BLOCK):
@@ -102,81 +104,70 @@ def _mass_of(blocks):  # type: ignore[no-untyped-def]
     return out
 
 
-@nb.njit(cache=True, parallel=True)
-def _weigh(blocks, llr, low, high):  # type: ignore[no-untyped-def]
-    """Multiply blocks by the bounded likelihood ratio, in place: a frame is wrong as a whole with chance e^low."""
-    floor = math.exp(low)
-    for t in nb.prange(blocks.shape[0]):
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                v = blocks[t, i, j] * np.float32(math.exp(min(llr[t, i, j], high)) + floor)
-                # Below this a cell weighs nothing even after the largest ratio; denormals would cost time.
-                blocks[t, i, j] = v if v > 1e-25 else np.float32(0.0)
+def _factor(llr: F32, low: float, high: float) -> F32:
+    """The bounded likelihood ratio, written over ``llr``: a frame is wrong as a whole with chance e^low."""
+    np.minimum(llr, np.float32(high), out=llr)
+    np.exp(llr, out=llr)
+    llr += np.float32(math.exp(low))
+    return llr
 
 
-@nb.njit(cache=True, parallel=True)
-def _search_heading(llr, listed, blocks, even, low, high, threshold, masses, kept, out):  # type: ignore[no-untyped-def]
-    """One heading of a whole-map update: posterior block masses, and the blocks above the threshold.
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _search_heading(factor, listed, blocks, even, masses):  # type: ignore[no-untyped-def]
+    """Posterior mass of every block of one heading; ``listed`` (nby, nbx) holds the row of a listed block or -1.
 
-    ``listed`` (nby, nbx) holds the row of a listed block or -1; ``even`` is the prior mass per cell of ``rest``.
+    ``even`` is the prior mass per cell of ``rest``.
     """
-    ny, nx = llr.shape
-    nby, nbx = listed.shape
-    floor = math.exp(low)
-    for by in nb.prange(nby):
-        for bx in range(nbx):
+    ny, nx = factor.shape
+    for by in range(listed.shape[0]):
+        for bx in range(listed.shape[1]):
             s = listed[by, bx]
-            total = 0.0
+            total = np.float32(0.0)
+            wide = min(BLOCK, nx - bx * BLOCK)
             for i in range(min(BLOCK, ny - by * BLOCK)):
-                for j in range(min(BLOCK, nx - bx * BLOCK)):
-                    prior = even
-                    if s >= 0:
-                        prior += blocks[s, i, j]
-                    v = prior * (math.exp(min(llr[by * BLOCK + i, bx * BLOCK + j], high)) + floor)
-                    total += v
+                row = factor[by * BLOCK + i, bx * BLOCK : bx * BLOCK + wide]
+                if s >= 0:
+                    for j in range(wide):
+                        total += (even + blocks[s, i, j]) * row[j]
+                else:
+                    for j in range(wide):
+                        total += even * row[j]
             masses[by, bx] = total
-            kept[by, bx] = total > threshold
-    n = 0
-    for by in range(nby):
-        for bx in range(nbx):
-            if kept[by, bx]:
-                if n < out.shape[0]:
-                    s = listed[by, bx]
-                    for i in range(BLOCK):
-                        for j in range(BLOCK):
-                            out[n, i, j] = 0.0
-                    for i in range(min(BLOCK, ny - by * BLOCK)):
-                        for j in range(min(BLOCK, nx - bx * BLOCK)):
-                            prior = even
-                            if s >= 0:
-                                prior += blocks[s, i, j]
-                            out[n, i, j] = prior * (
-                                math.exp(min(llr[by * BLOCK + i, bx * BLOCK + j], high)) + floor
-                            )
-                n += 1
-    return n
 
 
-@nb.njit(cache=True, parallel=True)
-def _entropy(blocks):  # type: ignore[no-untyped-def]
-    part = np.zeros(blocks.shape[0], np.float64)
-    for t in nb.prange(blocks.shape[0]):
-        total = 0.0
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _take_blocks(factor, listed, blocks, even, cells, out):  # type: ignore[no-untyped-def]
+    """Posterior blocks at ``cells`` (n, 2) block row, block col."""
+    ny, nx = factor.shape
+    for n in range(cells.shape[0]):
+        by, bx = cells[n, 0], cells[n, 1]
+        s = listed[by, bx]
         for i in range(BLOCK):
             for j in range(BLOCK):
-                v = blocks[t, i, j]
-                if v > 0:
-                    total -= v * math.log(v)
-        part[t] = total
-    return part.sum()
+                y, x = by * BLOCK + i, bx * BLOCK + j
+                v = np.float32(0.0)
+                if y < ny and x < nx:
+                    v = (even + blocks[s, i, j] if s >= 0 else even) * factor[y, x]
+                # Below this a cell weighs nothing even after the largest ratio; denormals would cost time.
+                out[n, i, j] = v if v > 1e-25 else np.float32(0.0)
 
 
-def _step_kernel(fraction: float, sigma: float, reach: int) -> F32:
-    """Weights of whole-cell offsets -reach..reach for a normal of mean ``fraction`` and deviation ``sigma`` cells."""
-    edges = (np.arange(-reach, reach + 2) - 0.5 - fraction) / (sigma * math.sqrt(2.0))
-    cdf = np.array([math.erf(e) for e in edges])
-    weights = np.diff(cdf)
-    return (weights / weights.sum()).astype(np.float32)
+@nb.njit(cache=True, nogil=True)
+def _entropy(blocks):  # type: ignore[no-untyped-def]
+    total = 0.0
+    flat = blocks.reshape(-1)
+    for t in range(flat.shape[0]):
+        v = flat[t]
+        if v > 1e-12:
+            total -= v * math.log(v)
+    return total
+
+
+def _step_kernels(fraction: F64, sigma: float, reach: int) -> F32:
+    """(n, 2 reach + 1) weights of whole-cell offsets for normals of mean ``fraction`` and deviation ``sigma`` cells."""
+    edges = (np.arange(-reach, reach + 2) - 0.5 - fraction[:, None]) / (sigma * math.sqrt(2.0))
+    weights = np.diff(erf(edges), axis=1)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,11 +284,16 @@ class Belief:
             whole = np.rint(moved).astype(np.int64)
             sigma = max(sigma, 0.4)
             reach = max(2, math.ceil(3.0 * sigma + 0.5))
-            ky = np.stack([_step_kernel(f, sigma, reach) for f in (moved - whole)[:, 0]])
-            kx = np.stack([_step_kernel(f, sigma, reach) for f in (moved - whole)[:, 1]])
+            ky = _step_kernels((moved - whole)[:, 0], sigma, reach)
+            kx = _step_kernels((moved - whole)[:, 1], sigma, reach)
             targets = self._reached(whole, reach)
             out = self._buffer(len(targets))
-            _move(self.blocks, self.index, targets, whole, ky, kx, reach, *self.shape, out)
+            blocks, index, shape = self.blocks, self.index, self.shape
+            split(
+                lambda t0, t1: _move(blocks, index, targets, whole, ky, kx, reach, *shape, out, t0, t1),
+                len(targets),
+                200,
+            )
             self._swap(targets, out)
             self.prune()
             self._mix_headings(heading_share)
@@ -334,7 +330,8 @@ class Belief:
         targets = np.argwhere(mark).astype(np.int32)
         out = self._buffer(len(targets))
         before = float(mass.sum())
-        _mix(self.blocks, self.index, targets, share, out)
+        blocks, index = self.blocks, self.index
+        split(lambda t0, t1: _mix(blocks, index, targets, share, out, t0, t1), len(targets), 1000)
         self._swap(targets, out)
         # What would have gone to unlisted neighbours lies somewhere on the map.
         self.rest += before - float(self.blocks.sum(dtype=np.float64))
@@ -422,8 +419,9 @@ class Belief:
         self.prune()
 
     def update(self, llr: F32, low: float, high: float) -> float:
-        """Weigh listed blocks by (n, 16, 16) log-likelihood ratios, bounded; returns the log of the evidence."""
-        _weigh(self.blocks, llr, low, high)
+        """Weigh listed blocks by (n, 16, 16) log-likelihood ratios, which are overwritten; returns the log of the evidence."""
+        self.blocks *= _factor(llr, low, high)
+        self.blocks[self.blocks < 1e-25] = 0.0
         total = self._normalise()
         self.prune()
         return math.log(total)
@@ -432,7 +430,8 @@ class Belief:
         """Weigh the whole grid, unlisted ground included, and list what stands out; returns the log of the evidence.
 
         Args:
-            llr_of: gives the (rows, cols) float32 log-likelihood ratios of one heading bin, or None to rule it out.
+            llr_of: gives the (rows, cols) float32 log-likelihood ratios of one heading bin, which are overwritten, or
+                None to rule the heading out.
             low, high: bounds of the ratios.
             heading_prior: (headings,) mean 1, how ``rest`` is spread over headings; None for evenly.
         """
@@ -444,21 +443,22 @@ class Belief:
         count = 0
         mass_all = 0.0
         masses = np.zeros(self.grid, np.float64)
-        kept = np.zeros(self.grid, np.bool_)
-        out = np.empty((self.grid[0] * self.grid[1], BLOCK, BLOCK), np.float32)
         for h in range(self.headings):
             llr = llr_of(h)
             if llr is None:
                 continue
             weight = 1.0 if heading_prior is None else float(heading_prior[h])
-            even = self.rest * weight / self.cells
-            n = _search_heading(llr, self.index[h], self.blocks, even, low, high, threshold, masses, kept, out)
+            even = np.float32(self.rest * weight / self.cells)
+            factor = _factor(llr, low, high)
+            _search_heading(factor, self.index[h], self.blocks, even, masses)
             mass_all += float(masses.sum())
-            if n:
-                cells = np.argwhere(kept)
-                keys.append(np.concatenate([np.full((n, 1), h), cells], axis=1).astype(np.int32))
-                parts.append(out[:n].copy())
-                count += n
+            cells = np.argwhere(masses > threshold)
+            if len(cells):
+                out = np.empty((len(cells), BLOCK, BLOCK), np.float32)
+                _take_blocks(factor, self.index[h], self.blocks, even, cells, out)
+                keys.append(np.concatenate([np.full((len(cells), 1), h), cells], axis=1).astype(np.int32))
+                parts.append(out)
+                count += len(cells)
             if count > 2 * limit:
                 threshold = self._raise_threshold(keys, parts, limit)
                 count = sum(map(len, keys))

@@ -182,7 +182,7 @@ class GridMatcher(ABC):
                 top = llr.copy() if top is None else np.logaddexp(top, llr)
         assert top is not None
         mean = np.asarray(top - math.log(self.belief.headings), np.float32)
-        return lambda h: mean
+        return lambda h: mean.copy()
 
     def _update_any_heading(self, view: View, low: float, high: float) -> float:
         """The same at listed blocks: every place that is listed under any heading is scored under all."""

@@ -23,6 +23,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numba as nb
 import numpy as np
 import scipy.fft
@@ -31,6 +32,7 @@ from numpy.typing import NDArray
 from brmgeo.flight.values import View
 from brmgeo.match.belief import BLOCK
 from brmgeo.match.settings import RateSettings, RatioSettings
+from brmgeo.match.threads import THREADS, pool, split
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -147,11 +149,13 @@ class RateLearner:
         return np.array([share, 1.0 - share]) * self.PRIOR
 
 
-@nb.njit(cache=True, parallel=True)
-def _splat(forward, left, built, known, yaw, cell, reach, out_k, out_w):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True)
+def _splat(forward, left, built, known, yaw, wanted, cell, reach, out_k, out_w, h0, h1):  # type: ignore[no-untyped-def]
     """Patches laid onto cells about the nadir's cell for each yaw, area shared between the four nearest centres."""
     size = 2 * reach + 1
-    for h in nb.prange(yaw.shape[0]):
+    for h in range(h0, h1):
+        if not wanted[h]:
+            continue
         c, s = math.cos(yaw[h]), math.sin(yaw[h])
         for i in range(size):
             for j in range(size):
@@ -173,17 +177,26 @@ def _splat(forward, left, built, known, yaw, cell, reach, out_k, out_w):  # type
 
 
 def mask_templates(
-    points: ViewPoints, yaw_rad: F64, cell_m: float, rates: Rates
+    points: ViewPoints, yaw_rad: F64, cell_m: float, rates: Rates, wanted: NDArray[np.bool_] | None = None
 ) -> tuple[F32, F32]:
-    """Templates a and b of the mask's log-likelihood ratio, for each yaw of the body in the map.
+    """Templates a and b of the mask's log-likelihood ratio, for each yaw of the body in the map (zeros where not wanted).
 
     Returns two (yaws, 2 R + 1, 2 R + 1) float32: the ratio at a cell is the sum over the template of a times the map's building
     share and b times its known share, the template's middle on the cell.
     """
     reach = math.ceil(points.reach_m / cell_m) + 1
     shape = (len(yaw_rad), 2 * reach + 1, 2 * reach + 1)
-    k, w = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    _splat(points.forward, points.left, points.built, points.known, yaw_rad, cell_m, reach, k, w)
+    k, w = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    if wanted is None:
+        wanted = np.ones(len(yaw_rad), np.bool_)
+    shown = wanted
+    split(
+        lambda h0, h1: _splat(
+            points.forward, points.left, points.built, points.known, yaw_rad, shown, cell_m, reach, k, w, h0, h1
+        ),
+        len(yaw_rad),
+        8 if shown.sum() > 16 else len(yaw_rad),
+    )
     a_k, a_o, b_k, b_o = rates.weights(points.rate)
     w -= k
     return np.float32(a_k) * k + np.float32(a_o) * w, np.float32(b_k) * k + np.float32(b_o) * w
@@ -203,8 +216,7 @@ class MapCover:
         self.shape = built.shape
         self._margin = -1
         self._built_pad = self._known_pad = np.empty((0, 0), np.float32)
-        self._spectra: dict[tuple[int, int], tuple[NDArray[np.complex64], NDArray[np.complex64]]] = {}
-        self._spectra_reach = -1
+        self._reach = -1
 
     def padded(self, margin: int) -> tuple[F32, F32]:
         """Both covers with at least ``margin`` cells of unknown ground around, rows and cols to whole blocks."""
@@ -224,62 +236,91 @@ class MapCover:
         if len(keys):
             reach = a.shape[1] // 2
             built, known = self.padded(reach)
-            _score_blocks(built, known, keys, a, b, out)
+            split(lambda t0, t1: _score_blocks(built, known, keys, a, b, out, t0, t1), len(keys), 16)
         return out
 
     def score_all(self, a: F32, b: F32, wanted: NDArray[np.bool_]) -> Iterator[F32 | None]:
         """Ratios at every cell, heading by heading: (rows, cols) float32, or None where ``wanted`` is False.
 
-        By Fourier transforms of tiles of at most 1024 cells, so memory does not follow the map. Tiles without any building
-        within reach need none.
+        By Fourier transforms of tiles of at most 1024 cells, a few headings at a time, so memory does not follow the number of
+        headings. The known cover's part varies slowly: it is summed on cells four times as large and interpolated, which
+        changes the ratio only near the edge of known ground, by a few hundredths of the template's sum at most.
         """
         reach = a.shape[1] // 2
+        self._prepare(reach)
+        for first in range(0, len(a), THREADS):
+            some = [h for h in range(first, min(first + THREADS, len(a))) if wanted[h]]
+            outs = pool().map(lambda h: self._correlate(a[h], b[h], reach), some)
+            for h in range(first, min(first + THREADS, len(a))):
+                yield next(outs) if wanted[h] else None
+
+    def _prepare(self, reach: int) -> None:
+        """Tiles, their size and, for small maps, their spectra for templates of this reach."""
+        if self._reach == reach:
+            return
+        self._reach = reach
         rows, cols = self.shape
         core = self.TILE - 2 * reach if max(self.shape) > self.TILE else max(self.shape)
-        tiles = [(r, c) for r in range(0, rows, core) for c in range(0, cols, core)]
-        size = (
+        if core < 64:
+            core = max(self.shape)
+        self._tiles = [
+            (r, c, min(core, rows - r), min(core, cols - c))
+            for r in range(0, rows, core)
+            for c in range(0, cols, core)
+        ]
+        self._size = (
             scipy.fft.next_fast_len(min(rows, core) + 2 * reach, real=True),
             scipy.fft.next_fast_len(min(cols, core) + 2 * reach, real=True),
         )
-        if self._spectra_reach != reach:
-            self._spectra.clear()
-            self._spectra_reach = reach
+        self._spectra: list[NDArray[np.complex64] | None] = []
         built, known = self.padded(reach)
-        out = np.empty((rows, cols), np.float32)
-        keep = len(tiles) <= 16
-        for h in range(len(a)):
-            if not wanted[h]:
-                yield None
-                continue
-            template_a = np.zeros(size, np.float32)
-            template_b = np.zeros(size, np.float32)
-            template_a[: a.shape[1], : a.shape[2]] = a[h]
-            template_b[: a.shape[1], : a.shape[2]] = b[h]
-            fa = np.conj(scipy.fft.rfft2(template_a, workers=2))
-            fb = np.conj(scipy.fft.rfft2(template_b, workers=2))
-            for r, c in tiles:
-                h_cut, w_cut = min(core, rows - r), min(core, cols - c)
-                spectrum = self._spectra.get((r, c))
-                if spectrum is None:
-                    cut = (slice(r, r + h_cut + 2 * reach), slice(c, c + w_cut + 2 * reach))
-                    spectrum = (
-                        scipy.fft.rfft2(built[cut], s=size, workers=2),
-                        scipy.fft.rfft2(known[cut], s=size, workers=2),
-                    )
-                    if keep:
-                        self._spectra[r, c] = spectrum
-                product = spectrum[0] * fa
-                product += spectrum[1] * fb
-                out[r : r + h_cut, c : c + w_cut] = scipy.fft.irfft2(
-                    product, s=size, overwrite_x=True, workers=2
-                )[:h_cut, :w_cut]
-            yield out
+        keep = len(self._tiles) <= 16
+        for r, c, h, w in self._tiles:
+            cut = built[r : r + h + 2 * reach, c : c + w + 2 * reach]
+            # Without a building in reach the correlation with ``a`` is zero; without room to keep it, it is made anew.
+            self._spectra.append(
+                scipy.fft.rfft2(cut, s=self._size) if keep and cut.any() else None
+            )
+        self._keep = keep
+        n, m = -(-known.shape[0] // 4), -(-known.shape[1] // 4)
+        wide = np.zeros((n * 4, m * 4), np.float32)
+        wide[: known.shape[0], : known.shape[1]] = known
+        coarse = wide.reshape(n, 4, m, 4).mean(axis=(1, 3))
+        self._coarse_size = (scipy.fft.next_fast_len(n, real=True), scipy.fft.next_fast_len(m, real=True))
+        self._coarse_known = scipy.fft.rfft2(coarse, s=self._coarse_size)
+
+    def _correlate(self, a: F32, b: F32, reach: int) -> F32:
+        rows, cols = self.shape
+        side = -(-b.shape[0] // 4) * 4
+        wide = np.zeros((side, side), np.float32)
+        wide[: b.shape[0], : b.shape[1]] = b
+        sums = wide.reshape(side // 4, 4, side // 4, 4).sum(axis=(1, 3))
+        product = np.conj(scipy.fft.rfft2(sums, s=self._coarse_size))
+        product *= self._coarse_known
+        slow = scipy.fft.irfft2(product, s=self._coarse_size, overwrite_x=True)
+        affine = np.array([[0.25, 0.0, 0.0], [0.0, 0.25, 0.0]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        out: F32 = cv2.warpAffine(slow, affine, (cols, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        template: NDArray[np.complex64] | None = None
+        built, _ = self.padded(reach)
+        for (r, c, h, w), kept in zip(self._tiles, self._spectra):
+            spectrum = kept
+            if spectrum is None:
+                cut = built[r : r + h + 2 * reach, c : c + w + 2 * reach]
+                if self._keep or not cut.any():
+                    continue
+                spectrum = scipy.fft.rfft2(cut, s=self._size)
+            if template is None:
+                template = np.conj(scipy.fft.rfft2(a, s=self._size))
+            fast = scipy.fft.irfft2(spectrum * template, s=self._size, overwrite_x=True)
+            out[r : r + h, c : c + w] += fast[:h, :w]
+        return out
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
-def _score_blocks(built, known, keys, a, b, out):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _score_blocks(built, known, keys, a, b, out, t0, t1):  # type: ignore[no-untyped-def]
     size = a.shape[1]
-    for t in nb.prange(keys.shape[0]):
+    for t in range(t0, t1):
         h, top, left = keys[t, 0], keys[t, 1] * BLOCK, keys[t, 2] * BLOCK
         acc = np.zeros((BLOCK, BLOCK), np.float32)
         # Where all ground in reach is known, the second correlation is the template's sum.
@@ -341,13 +382,13 @@ def view_rings(view: View, count: int) -> Rings:
     return Rings(share, n * view.gsd_m**2, radius)
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
-def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, out):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, out, i0, i1):  # type: ignore[no-untyped-def]
     """log p(rings | cell): (rows, cols) from (n, rows, cols) square metres of building and known in the map's rings."""
     n, rows, cols = built.shape
     # lgamma terms make densities of different widths comparable with the even spread of the background.
     const = math.lgamma((dof + 1) / 2) - math.lgamma(dof / 2) - 0.5 * math.log(dof * math.pi)
-    for i in nb.prange(rows):
+    for i in range(i0, i1):
         for j in range(cols):
             total = 0.0
             for k in range(n):
@@ -388,9 +429,13 @@ class RingMatcher:
         move = ((dx**2).mean(axis=(1, 2)) + (dy**2).mean(axis=(1, 2))).astype(np.float64) / 12.0
         out = np.empty(built_ring.shape[1:], np.float32)
         s = self._settings
-        _ring_loglik(
-            built_ring, known_ring, rings.share, rings.area_m2,
-            rates.hit, rates.false_alarm, rates.independent_m2, s.noise, move, s.dof, out,
+        split(
+            lambda i0, i1: _ring_loglik(
+                built_ring, known_ring, rings.share, rings.area_m2,
+                rates.hit, rates.false_alarm, rates.independent_m2, s.noise, move, s.dof, out, i0, i1,
+            ),
+            len(out),
+            64,
         )  # fmt: skip
         top = float(out.max())
         own = top + math.log(float(np.exp(out - top, dtype=np.float64).mean()))

@@ -34,22 +34,24 @@ class MaskMatcher(GridMatcher):
         return self.settings.rates.llr_min, self.settings.rates.llr_max
 
     def _look(self, view: View) -> None:
-        # Four patches a cell and axis keep the patches' own size out of the templates.
-        self._points = view_points(view, self.cell_m / 4.0)
+        # Patches of half a cell, their area shared between cells, keep the patches' own size out of the templates.
+        self._points = view_points(view, self.cell_m / 2.0)
 
-    def _templates(self, yaw_rad: float) -> tuple[F32, F32]:
+    def _templates(self, yaw_rad: float, wanted: NDArray[np.bool_]) -> tuple[F32, F32]:
         assert self._points is not None
         yaw = self.belief.heading_of(np.arange(self.belief.headings)) + yaw_rad
-        return mask_templates(self._points, yaw, self.cell_m, self._learner.rates)
+        return mask_templates(self._points, yaw, self.cell_m, self._learner.rates, wanted)
 
     def _score_all(
         self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
     ) -> Callable[[int], F32 | None]:
-        scores = self._cover.score_all(*self._templates(yaw_rad), wanted)
+        scores = self._cover.score_all(*self._templates(yaw_rad, wanted), wanted)
         return lambda h: next(scores)
 
     def _score_listed(self, view: View, yaw_rad: float) -> F32:
-        return self._cover.score_blocks(self.belief.keys, *self._templates(yaw_rad))
+        wanted = np.zeros(self.belief.headings, np.bool_)
+        wanted[self.belief.keys[:, 0]] = True
+        return self._cover.score_blocks(self.belief.keys, *self._templates(yaw_rad, wanted))
 
     def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
         sigma = math.sqrt(max(float(covariance[0, 0]), float(covariance[1, 1])))

@@ -40,6 +40,7 @@ from brmgeo.match.grid import check_motion, check_view
 from brmgeo.match.ground import GroundMap
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor, SmoothedPath, smooth_path
+from brmgeo.match.threads import split
 from brmgeo.match.track import wrap
 
 U8 = NDArray[np.uint8]
@@ -47,98 +48,127 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 
-@nb.njit(cache=True, parallel=True)
-def search(maps, wanted, limit, out):  # type: ignore[no-untyped-def]
-    """Mark every pixel with sum_k |maps[k] - wanted[k]| < limit; returns how many.
-
-    maps: (n, H, W) uint16 ratios x 1e-4, 65535 unknown; wanted: (n,) float32 in the same unit; out: (H, W) uint8.
-    """
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _search(maps, wanted, limit, counts, out, i0, i1):  # type: ignore[no-untyped-def]
     n, rows, cols = maps.shape
-    counts = np.zeros(rows, np.int64)
-    for i in nb.prange(rows):
-        line = np.zeros(cols, np.float32)
+    line = np.empty(cols, np.int32)
+    for i in range(i0, i1):
+        line[:] = 0
         for k in range(n):
             source = maps[k, i]
             f = wanted[k]
             for j in range(cols):
-                v = source[j]
-                line[j] += abs(np.float32(v) - f) if v != 65535 else np.float32(1e9)
+                v = np.int32(source[j])
+                # 65535 is further than any limit from any ratio.
+                line[j] += abs(v - f) + (v == 65535) * 1_000_000
         total = 0
+        target = out[i]
         for j in range(cols):
             hit = line[j] < limit
-            out[i, j] = hit
+            target[j] = hit
             total += hit
         counts[i] = total
-    return counts.sum()
 
 
-@nb.njit(cache=True)
-def _runs(mask, row, starts, ends):  # type: ignore[no-untyped-def]
-    """Runs [start, end) of set pixels in a row; returns how many."""
-    n = 0
-    cols = mask.shape[1]
-    j = 0
-    while j < cols:
-        if mask[row, j]:
-            starts[n] = j
-            while j < cols and mask[row, j]:
-                j += 1
-            ends[n] = j
-            n += 1
-        else:
-            j += 1
-    return n
+def search(maps: NDArray[np.uint16], f: F64, e1: float, out: U8) -> int:
+    """Mark every pixel with sum_k |M_k - f_k| < e1 (eq. 5); returns how many.
 
-
-@nb.njit(cache=True, parallel=True)
-def _gather_ring(mask, spans, reach, bands, out):  # type: ignore[no-untyped-def]
-    """Keep in ``out`` only the pixels p with p - q in the ring for some set q of ``mask``.
-
-    spans: (2 reach + 1, 4) int64, column offsets [a, b) and [c, d) that the ring covers in each row offset; a >= b: none.
-    Works on difference rows: each run of the mask adds one span of reached pixels per part of the ring. Bands of rows run
-    in parallel.
+    Args:
+        maps: (n, H, W) uint16 ratios x 1e-4, 65535 unknown: such a pixel is never marked.
+        f: (n,) ratios in [0, 1]; compared to the nearest 1e-4, as the maps are.
+        e1: bound.
+        out: (H, W) uint8, written.
     """
-    rows, cols = mask.shape
-    starts_all = np.empty((rows, cols // 2 + 1), np.int32)
-    ends_all = np.empty((rows, cols // 2 + 1), np.int32)
-    counts = np.zeros(rows, np.int64)
-    for i in nb.prange(rows):
-        counts[i] = _runs(mask, i, starts_all[i], ends_all[i])
-    left = np.zeros(rows, np.int64)
-    for band in nb.prange(bands):
-        diff = np.zeros(cols + 1, np.int32)
-        for i in range(rows * band // bands, rows * (band + 1) // bands):
-            some = False
-            for j in range(cols):
-                if out[i, j]:
-                    some = True
-                    break
-            if not some:
+    counts = np.empty(maps.shape[1], np.int64)
+    wanted = np.rint(f * 1e4).astype(np.int32)
+    limit = np.int32(min(math.ceil(e1 * 1e4 - 1e-6), 900_000))
+    split(lambda i0, i1: _search(maps, wanted, limit, counts, out, i0, i1), len(counts), 64)
+    return int(counts.sum())
+
+
+@nb.njit(cache=True, nogil=True)
+def _runs(mask, starts, ends, counts, i0, i1):  # type: ignore[no-untyped-def]
+    """Runs [start, end) of set pixels of each row, and how many there are."""
+    cols = mask.shape[1]
+    for i in range(i0, i1):
+        row = mask[i]
+        n = 0
+        before = np.uint8(0)
+        for j in range(cols):
+            v = row[j]
+            if v != before:
+                if v:
+                    starts[i, n] = j
+                else:
+                    ends[i, n] = j
+                    n += 1
+                before = v
+        if before:
+            ends[i, n] = cols
+            n += 1
+        counts[i] = n
+
+
+@nb.njit(cache=True, nogil=True)
+def _keep_reached(starts, ends, counts, spans, reach, out, left, i0, i1):  # type: ignore[no-untyped-def]
+    """Clear every pixel of rows [i0, i1) of ``out`` that no run reaches; ``left`` counts what stays in each row.
+
+    A run [s, e) reaches, in the row t below it, the columns [s + a, e - 1 + b) of each span [a, b) of that row offset: one
+    step up and one down in a row of differences, whatever the length.
+    """
+    rows, cols = out.shape
+    diff = np.zeros(cols + 1, np.int32)
+    for i in range(i0, i1):
+        target = out[i]
+        some = np.uint8(0)
+        for j in range(cols):
+            some |= target[j]
+        left[i] = 0
+        if not some:
+            continue
+        diff[:] = 0
+        for t in range(2 * reach + 1):
+            q = i - (t - reach)
+            if q < 0 or q >= rows:
                 continue
-            diff[:] = 0
-            for t in range(2 * reach + 1):
-                q = i - (t - reach)
-                if q < 0 or q >= rows:
+            for part in range(0, 4, 2):
+                lo, hi = spans[t, part], spans[t, part + 1]
+                if lo >= hi:
                     continue
-                for part in range(2):
-                    lo, hi = spans[t, 2 * part], spans[t, 2 * part + 1]
-                    if lo >= hi:
-                        continue
-                    for r in range(counts[q]):
-                        a = max(0, starts_all[q, r] + lo)
-                        b = min(cols, ends_all[q, r] - 1 + hi)
-                        if a < b:
-                            diff[a] += 1
-                            diff[b] -= 1
-            depth = 0
-            kept = 0
-            for j in range(cols):
-                depth += diff[j]
-                if depth == 0:
-                    out[i, j] = 0
-                kept += out[i, j]
-            left[i] = kept
-    return left.sum()
+                for r in range(counts[q]):
+                    a = max(0, starts[q, r] + lo)
+                    b = min(cols, ends[q, r] - 1 + hi)
+                    if a < b:
+                        diff[a] += 1
+                        diff[b] -= 1
+        depth = 0
+        kept = 0
+        for j in range(cols):
+            depth += diff[j]
+            v = target[j] & np.uint8(depth > 0)
+            target[j] = v
+            kept += v
+        left[i] = kept
+
+
+class RingReach:
+    """Which pixels can be reached from a set of pixels by a ring of offsets; its buffers are kept between calls."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._starts = np.empty((shape[0], shape[1] // 2 + 1), np.int32)
+        self._ends = np.empty_like(self._starts)
+        self._counts = np.empty(shape[0], np.int64)
+        self._left = np.empty(shape[0], np.int64)
+
+    def keep(self, mask: U8, spans: NDArray[np.int64], reach: int, out: U8) -> int:
+        """Clear in ``out`` all p without a set q of ``mask`` whose offset p - q lies in the spans; returns what is left.
+
+        ``spans`` is (2 reach + 1, 4) int64 as ``ring_spans`` gives it; row offsets count downwards.
+        """
+        starts, ends, counts, left = self._starts, self._ends, self._counts, self._left
+        split(lambda i0, i1: _runs(mask, starts, ends, counts, i0, i1), len(counts), 64)
+        split(lambda i0, i1: _keep_reached(starts, ends, counts, spans, reach, out, left, i0, i1), len(left), 64)
+        return int(left.sum())
 
 
 def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple[NDArray[np.int64], int]:
@@ -170,7 +200,7 @@ def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple
     return spans, reach
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distance, eps, limit, pairs):  # type: ignore[no-untyped-def]
     """Pairs (new, previous) that eq. 4 and 6 allow.
 
@@ -225,6 +255,7 @@ class PaperMatcher:
         self._maps: OrderedDict[int, NDArray[np.uint16]] = OrderedDict()
         self._now = np.zeros(shape, np.uint8)
         self._before = np.zeros(shape, np.uint8)
+        self._reach = RingReach(shape)
         self._have = False
         self._count = 0
         # Pairs behind eq. 4: candidates (m, 2) and the directions in which each arrived, odometry frame of the last step.
@@ -263,8 +294,7 @@ class PaperMatcher:
         f = features(view, s.radii)
         restarted = False
         if np.isfinite(f.f).all():
-            wanted = (f.f * 1e4).astype(np.float32)
-            found = search(self._ratios(f.radii_m), wanted, np.float32(s.e1 * 1e4), self._now)
+            found = search(self._ratios(f.radii_m), f.f, s.e1, self._now)
         else:
             self._now[:] = 1
             found = self._now.size
@@ -275,7 +305,10 @@ class PaperMatcher:
                 # None left: start again from this frame's own search.
                 restarted = True
                 self._places = None
-                found = search(self._ratios(f.radii_m), wanted, np.float32(s.e1 * 1e4), self._now) if np.isfinite(f.f).all() else found
+                if np.isfinite(f.f).all():
+                    search(self._ratios(f.radii_m), f.f, s.e1, self._now)
+                else:
+                    self._now[:] = 1
             else:
                 found = kept
         elif not found:
@@ -297,14 +330,14 @@ class PaperMatcher:
             if far > max(self._now.shape):
                 return int(np.count_nonzero(self._now))
             spans, reach = ring_spans(far, eps, inner=0.0)
-            return int(_gather_ring(self._before, spans, reach, 2 * nb.get_num_threads(), self._now))
+            return self._reach.keep(self._before, spans, reach, self._now)
         distance = float(np.hypot(*motion.step_m)) / g
         if self._places is not None and self._last_step is not None:
             kept = self._follow(motion, distance, eps)
             if kept >= 0:
                 return kept
         spans, reach = ring_spans(distance, eps)
-        kept = int(_gather_ring(self._before, spans, reach, 2 * nb.get_num_threads(), self._now))
+        kept = self._reach.keep(self._before, spans, reach, self._now)
         self._begin_pairs(distance, eps)
         return kept
 

@@ -42,7 +42,7 @@ class RatioMatcher(GridMatcher):
     def _score_all(
         self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
     ) -> Callable[[int], F32 | None]:
-        return lambda h: self._llr
+        return lambda h: self._llr.copy()
 
     def _score_listed(self, view: View, yaw_rad: float) -> F32:
         rows, cols = self.belief.shape

@@ -18,19 +18,24 @@ from numpy.typing import NDArray
 from brmgeo.flight.values import View
 from brmgeo.match.ground import UNKNOWN, GroundMap
 from brmgeo.match.likelihood import Rates, ViewPoints, view_points
+from brmgeo.match.threads import split
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
-def _offsets(built, known, forward, left, a, b, row, col, per_m, yaw, half, out):  # type: ignore[no-untyped-def]
-    """Sum of a * built + b * known at each (yaw, row offset, col offset); pixels outside the array are unknown."""
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _offsets(built, known, all_known, forward, left, a, b, row, col, per_m, yaw, half, out, h0, h1):  # type: ignore[no-untyped-def]
+    """Sum of a * built + b * known at each (yaw, row offset, col offset); pixels outside the array are unknown.
+
+    With ``all_known`` the array ``known`` is not read: it is 1 everywhere.
+    """
     size = 2 * half + 1
     rows, cols = built.shape
-    for h in nb.prange(yaw.shape[0]):
+    for h in range(h0, h1):
         c, s = math.cos(yaw[h]), math.sin(yaw[h])
         acc = np.zeros((size, size), np.float32)
+        total = np.float32(0.0)
         for n in range(forward.shape[0]):
             j = int(math.floor(col + (forward[n] * c - left[n] * s) * per_m))
             i = int(math.floor(row - (forward[n] * s + left[n] * c) * per_m))
@@ -44,12 +49,18 @@ def _offsets(built, known, forward, left, a, b, row, col, per_m, yaw, half, out)
                         jj = j - half + dj
                         if 0 <= jj < cols:
                             acc[di, dj] += va * built[ii, jj] + vb * known[ii, jj]
+            elif all_known:
+                total += vb
+                for di in range(size):
+                    line = built[i - half + di]
+                    for dj in range(size):
+                        acc[di, dj] += va * line[j - half + dj]
             else:
                 for di in range(size):
                     line, other = built[i - half + di], known[i - half + di]
                     for dj in range(size):
                         acc[di, dj] += va * line[j - half + dj] + vb * other[j - half + dj]
-        out[h] = acc
+        out[h] = acc + total
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +165,14 @@ class Registrar:
         left, top = origin if origin is not None else (self._ground.left, self._ground.top)
         col, row = (centre[0] - left) / cell, (top - centre[1]) / cell
         out = np.empty((len(yaw), 2 * half + 1, 2 * half + 1), np.float32)
-        _offsets(*shares, points.forward, points.left, a, b, row, col, 1.0 / cell, yaw, half, out)
+        whole = bool(shares[1].min() >= 0.9999)
+        split(
+            lambda h0, h1: _offsets(
+                *shares, whole, points.forward, points.left, a, b, row, col, 1.0 / cell, yaw, half, out, h0, h1
+            ),
+            len(yaw),
+            2,
+        )
         return out, np.zeros(2)
 
     def _result(
