@@ -21,6 +21,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -190,6 +191,8 @@ class _TilePlane:
         self.last = last
         # Every grid is square in tiles.
         self.width = self.height = (last + 1) * self.tile_px
+        # Pieces overlap by part of a tile: decode it once. 64 tiles are 16 MB.
+        self.tile = lru_cache(maxsize=64)(source.read)
 
     def read(self, window: Window) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         rgb = np.zeros((window.height, window.width, 3), dtype=np.uint8)
@@ -198,7 +201,7 @@ class _TilePlane:
         for tile_row in range(window.row // n, (window.row + window.height - 1) // n + 1):
             y = self.last - tile_row if self.source.grid.y_up else tile_row
             for tile_col in range(window.col // n, (window.col + window.width - 1) // n + 1):
-                image = self.source.read(Tile(tile_col, y))
+                image = self.tile(Tile(tile_col, y))
                 if image is None:
                     continue
                 r0, c0 = tile_row * n - window.row, tile_col * n - window.col
@@ -394,6 +397,7 @@ def _draw(
             _sample(
                 canvas,
                 known,
+                _whole_neighbourhoods(known),
                 r0,
                 c0,
                 u,
@@ -443,18 +447,49 @@ def _scale(plane: _Plane, box: GeoBox) -> tuple[float, float]:
     return float(su), float(sv)
 
 
+def _whole_neighbourhoods(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """True where all 4 x 4 pixels from (row, col) down and right are known; False where they leave the canvas."""
+    out = np.zeros_like(known)
+    if min(known.shape) >= 4:
+        across = known[:, :-3] & known[:, 1:-2] & known[:, 2:-1] & known[:, 3:]
+        out[:-3, :-3] = across[:-3] & across[1:-2] & across[2:-1] & across[3:]
+    return out
+
+
+@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator, unused-ignore]
+def _keys(f):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The four weights of cubic convolution (Keys 1981, a = -0.5) for a fraction f past the second pixel."""
+    return (
+        f * (-0.5 + f * (1.0 - 0.5 * f)),
+        1.0 + f * f * (-2.5 + 1.5 * f),
+        f * (0.5 + f * (2.0 - 1.5 * f)),
+        f * f * (-0.5 + 0.5 * f),
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator, unused-ignore]
+def _row(canvas, r, c, band, a0, a1, a2, a3):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Four weighted pixels of one row."""
+    return (
+        a0 * canvas[r, c, band]
+        + a1 * canvas[r, c + 1, band]
+        + a2 * canvas[r, c + 2, band]
+        + a3 * canvas[r, c + 3, band]
+    )
+
+
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def _sample(  # type: ignore[no-untyped-def]  # pragma: no cover
-    canvas, known, canvas_row, canvas_col, node_u, node_v, row0, col0, span_u, span_v, out, out_valid
+    canvas, known, whole, canvas_row, canvas_col, node_u, node_v, row0, col0, span_u, span_v, out, out_valid
 ):
     """Sample ``canvas`` (source pixels from canvas_row, canvas_col) for every pixel of ``out`` that is not valid yet.
 
+    ``known``: its known pixels; ``whole``: see ``_whole_neighbourhoods``.
     ``node_u``, ``node_v``: source columns and rows at cell corners, of which the first lies (row0, col0) pixels before
     ``out``. ``span_u``, ``span_v``: size of a lattice pixel in source pixels to average over, or 0 for cubic convolution.
     """
     height, width = out_valid.shape
     rows, cols = known.shape
-    wu, wv = np.empty(4), np.empty(4)
     total = np.empty(3)
     for i in range(height):
         ki = (row0 + i) // 32
@@ -497,25 +532,18 @@ def _sample(  # type: ignore[no-untyped-def]  # pragma: no cover
             else:
                 left, top = math.floor(u - 0.5), math.floor(v - 0.5)
                 fu, fv = u - 0.5 - left, v - 0.5 - top
-                whole = True
-                for r in range(top - 1 - canvas_row, top + 3 - canvas_row):
-                    for c in range(left - 1 - canvas_col, left + 3 - canvas_col):
-                        if r < 0 or r >= rows or c < 0 or c >= cols or not known[r, c]:
-                            whole = False
-                if whole:
-                    for f, w4 in ((fu, wu), (fv, wv)):
-                        w4[0] = f * (-0.5 + f * (1.0 - 0.5 * f))
-                        w4[1] = 1.0 + f * f * (-2.5 + 1.5 * f)
-                        w4[2] = f * (0.5 + f * (2.0 - 1.5 * f))
-                        w4[3] = f * f * (-0.5 + 0.5 * f)
-                    for m in range(4):
-                        for n in range(4):
-                            w = wv[m] * wu[n]
-                            weight += w
-                            for band in range(3):
-                                total[band] += (
-                                    w * canvas[top - 1 + m - canvas_row, left - 1 + n - canvas_col, band]
-                                )
+                r, c = top - 1 - canvas_row, left - 1 - canvas_col
+                if r >= 0 and r < rows and c >= 0 and c < cols and whole[r, c]:
+                    a0, a1, a2, a3 = _keys(fu)
+                    b0, b1, b2, b3 = _keys(fv)
+                    weight = (a0 + a1 + a2 + a3) * (b0 + b1 + b2 + b3)
+                    for band in range(3):
+                        total[band] = (
+                            b0 * _row(canvas, r, c, band, a0, a1, a2, a3)
+                            + b1 * _row(canvas, r + 1, c, band, a0, a1, a2, a3)
+                            + b2 * _row(canvas, r + 2, c, band, a0, a1, a2, a3)
+                            + b3 * _row(canvas, r + 3, c, band, a0, a1, a2, a3)
+                        )
                 else:
                     for m in range(2):
                         for n in range(2):
