@@ -140,7 +140,7 @@ def write_maps_project(
     tree: list[_Layer | _Group] = [
         _Group("Buildings", vectors),
         mask,
-        _Group("Ratio maps", ratios, exclusive=True),
+        _Group("Share of building", ratios, exclusive=True),
     ]
     if imagery is not None:
         image_crs, _, image_bands = _raster_facts(imagery)
@@ -198,29 +198,25 @@ def write_flight_project(
         return [_Layer(layer_id, name, source, crs, looks, geometry, visible, attribution)]
 
     tracks = {name: style.track_styles(name) for name in ("online", "smoothed", "reference")}
-    now = vector("fix_now", "online", "Fix, two sigma ring and heading", tracks["online"][0])
+    now = vector("fix_now", "online", "Fix (ring: 2 sigma)", tracks["online"][0])
     now += vector("smoothed_now", "smoothed", "Smoothed position", tracks["smoothed"][0])
     now += vector("reference_now", "reference", "Reference position", tracks["reference"][0])
-    suffix = "" if candidates.suffix == ".geojson" else f"|layername={candidates.stem}"
-    candidates_crs = CRS.from_epsg(4326) if candidates.suffix == ".geojson" else crs
-    source = f"./{candidates.name}{suffix}"
-    dots = _Layer(
-        "candidates",
-        "Candidates",
-        source,
-        candidates_crs,
-        style.candidates_style(),
-        "Point",
-        True,
-        attribution,
-        True,
-    )
+    dots: list[_Layer] = []
+    # A GeoJSON file without features has no geometry type, and QGIS drops such a layer.
+    if pyogrio.read_info(candidates, force_feature_count=True)["features"]:
+        lonlat = candidates.suffix == ".geojson"
+        source = f"./{candidates.name}" + ("" if lonlat else f"|layername={candidates.stem}")
+        dots_crs = CRS.from_epsg(4326) if lonlat else crs
+        dots_look = style.candidates_style()
+        dots = [
+            _Layer("candidates", "Candidates", source, dots_crs, dots_look, "Point", True, attribution, True)
+        ]
     paths = vector("trail", "online", "Fixes so far", style.trail_style(style.ONLINE))
     paths += vector("reference_path", "reference_path", "Reference path", tracks["reference"][1])
     paths += vector("smoothed_path", "smoothed_path", "Smoothed path", tracks["smoothed"][1])
     paths += vector("online_path", "online_path", "Online fixes, whole flight", tracks["online"][1], False)
 
-    tree: list[_Layer | _Group] = [_Group("Now", now), dots, _Group("Paths", paths)]
+    tree: list[_Layer | _Group] = [_Group("Now", now), *dots, _Group("Paths", paths)]
     mask = style.mask_style("#ffffff", 90) if imagery is not None else style.mask_style("#5b6472", 230)
     tree.append(_Layer("buildings", "Building mask", f"{href}/{buildings.name}", crs, mask))
     if imagery is not None:
@@ -423,13 +419,16 @@ def _properties(root: ET.Element, attribution: str, clock: _Clock | None) -> Non
     properties = sub(root, "properties")
     sub(sub(properties, "Paths"), "Absolute", "false", type="bool")
     sub(sub(properties, "SpatialRefSys"), "ProjectionsEnabled", "1", type="int")
+    readable = ET.tostring(style.text_style(9, style.DARK), "unicode")
     scale_bar = sub(properties, "ScaleBar")
+    sub(scale_bar, "TextFormat", readable, type="QString")
     sub(scale_bar, "Enabled", "true", type="bool")
     sub(scale_bar, "Placement", "0", type="int")
     if attribution:
         label = sub(properties, "CopyrightLabel")
         sub(label, "Enabled", "true", type="bool")
         sub(label, "Label", attribution, type="QString")
+        sub(label, "Font", readable, type="QString")
         sub(label, "Placement", "3", type="int")
     if clock is not None:
         # Without these the controller opens switched off, and the layers show all times at once.

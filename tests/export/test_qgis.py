@@ -107,7 +107,7 @@ def test_layers_are_in_order_and_found_beside_the_project(region: Region, tmp_pa
     assert checked["brmgeo_ratio_2"] == "Qt::Unchecked"
     bands = [layers_of(root)[f"brmgeo_ratio_{i}"].find("pipe/rasterrenderer").get("band") for i in (1, 2)]
     assert bands == ["1", "2"]
-    assert layers_of(root)["brmgeo_ratio_2"].findtext("layername") == "Share of building within 19.7 m"
+    assert layers_of(root)["brmgeo_ratio_2"].findtext("layername") == "Within 19.7 m"
 
 
 def test_every_kind_in_the_footprints_has_a_style_in_plain_words(region: Region, tmp_path: Path) -> None:

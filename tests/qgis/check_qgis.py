@@ -81,7 +81,7 @@ def check_project(path, name, out, findings):
         return
     layers = project.layerTreeRoot().layerOrder()
     ids = [key(layer) for layer in layers]
-    flight = "candidates" in ids
+    flight = "fix_now" in ids
     kind = "flight" if flight else "maps"
     print(
         f"{path}: {kind} project in {project.crs().authid()}, {len(layers)} layers, title {project.title()!r}"
@@ -97,7 +97,9 @@ def check_project(path, name, out, findings):
     view = project.viewSettings().defaultViewExtent()
     for layer in layers:
         check_layer(layer, project, view, findings)
-    if flight:
+    if flight and "candidates" not in ids:
+        print("  no candidates, so nothing plays")
+    elif flight:
         check_times(project, findings)
         check_defaults(path.parent, findings)
         span = project.timeSettings().temporalRange()
