@@ -62,8 +62,19 @@ class Bar:
         self.done = 0
         self._label = label
         self._say = say
+        self._said = time.monotonic()
         self._rich = rich
         self._task = rich.add_task(label, total=None) if rich else None
+
+    def update(self, done: int, total: int) -> None:
+        """Shows that ``done`` of ``total`` items are done, for work that is not mapped."""
+        self.done = done
+        now = time.monotonic()
+        if self._rich and self._task is not None:
+            self._rich.update(self._task, completed=done, total=total)
+        elif now - self._said >= _EVERY_S and done < total:
+            self._said = now
+            self._say(f"{self._label}: {done} of {total}")
 
     def watch(self, map: Map) -> Map:
         """``map``, telling the bar of each result."""

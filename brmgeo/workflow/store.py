@@ -213,7 +213,7 @@ class Store:
             inputs[name] = self.build(item, map).path if isinstance(item, Step) else item
         doing = f"stage {step.label}"
         with self._workdir() as work:
-            out = work / "out"
+            out = work / step.key  # a stage may write its own key into what it makes
             with _disk(doing, self.root):
                 out.mkdir()
                 start = time.time()
@@ -277,7 +277,7 @@ class Store:
                 return  # another run made the same artifact meanwhile; equal keys mean equal contents
             os.rename(step.path, work / "old")
         try:
-            os.rename(work / "out", step.path)
+            os.rename(work / step.key, step.path)
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or self.find(step) is None:
                 raise

@@ -164,10 +164,12 @@ KILLED = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import workflow_toys as toys
+from brmgeo.workflow import schedule
 from brmgeo.workflow.plan import Plan
-from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.stage import Stage
 from brmgeo.workflow.store import Store
+
+schedule._has_dashboard = lambda: False  # it starts quicker so
 
 def run(inputs, out, settings, map):
     with open(out / "squares.txt", "w") as handle:
@@ -181,13 +183,13 @@ if __name__ == "__main__":
     store = Store(sys.argv[2])
     plan = Plan(store, "toy")
     plan.add(Stage("squares", 1, run), {}, {"n": 24})
-    with store.lock("toy"), scheduler(sys.argv[3], shared=store.root, workers=2) as map:
+    with store.lock("toy"), schedule.scheduler(sys.argv[3], shared=store.root, workers=2) as map:
         made = plan.build(map)
         print((made["squares"].path / "squares.txt").read_text().split()[-1])
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_killed_distributed_run_is_finished_by_the_next(how: signal.Signals, tmp_path: Path) -> None:
     script = tmp_path / "run.py"
     script.write_text(KILLED)
