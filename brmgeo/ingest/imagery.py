@@ -20,7 +20,7 @@ import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -41,7 +41,7 @@ from brmgeo.geo.crs import belt_for_sheet, crs_name, parse_crs, same_crs, transf
 from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import Tile
-from brmgeo.ingest.tiles import TileSource
+from brmgeo.ingest.tiles import TileService, TileSource, describe
 
 _CELL_PX = 32
 # The largest piece of a source that is held at once, pixels a side.
@@ -151,6 +151,22 @@ def check_imagery(sources: Sequence[ImagerySource], box: GeoBox) -> None:
             f"no image lies on the region: the nearest, {name} in {crs_name(crs)}, is {gap / 1000:.1f} km away; "
             "check its crs and the region's bounds"
         )
+
+
+def imagery_credits(sources: Sequence[ImagerySource | TileService]) -> tuple[str, str]:
+    """(attribution, terms) of all sources, each said once: what the outputs' metadata must carry."""
+    return (
+        "; ".join(dict.fromkeys(s.attribution for s in sources if s.attribution)),
+        "; ".join(dict.fromkeys(s.terms for s in sources if s.terms)),
+    )
+
+
+def describe_imagery(source: ImagerySource | TileService) -> dict[str, object]:
+    """What provenance keeps of a source, as plain values; never a key."""
+    if not isinstance(source, (GeoRaster, NgiiOrtho)):
+        return dict(describe(source))
+    facts = {name: value for name, value in asdict(source).items() if value not in (None, "")}
+    return {**facts, "path": str(source.path)}
 
 
 def source_files(source: ImagerySource, tiles: Sequence[Tile] = ()) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,15 @@ from brmgeo.geo.crs import transformer
 from brmgeo.geo.grid import Window, blocks, bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent
 from brmgeo.geo.tilegrid import KakaoGrid, Tile, TileGrid, WebMercatorGrid
-from brmgeo.ingest.imagery import GeoRaster, NgiiOrtho, check_imagery, mosaic_to_lattice, source_files
+from brmgeo.ingest.imagery import (
+    GeoRaster,
+    NgiiOrtho,
+    check_imagery,
+    describe_imagery,
+    imagery_credits,
+    mosaic_to_lattice,
+    source_files,
+)
 from brmgeo.ingest.tiles import TileFolder
 
 EAST = "EPSG:5187"
@@ -351,3 +360,41 @@ def test_convergence_is_real() -> None:
     """The two grids are turned against each other here, so the tests above exercise more than a shift."""
     x, y = transformer(EAST, "EPSG:5181").transform([175000.0, 175100.0], [563000.0, 563000.0])
     assert abs(math.degrees(math.atan2(y[1] - y[0], x[1] - x[0]))) > 0.9
+
+
+def test_credits_and_description(tmp_path: Path) -> None:
+    """Every attribution once, in order; a description holds what was stated and nothing empty."""
+    sources = [
+        GeoRaster(tmp_path / "a.tif", attribution="A", terms="free"),
+        TileFolder(tmp_path, KakaoGrid(), 2, attribution="B"),
+        GeoRaster(tmp_path / "b.tif", crs=EAST, attribution="A"),
+    ]
+    assert imagery_credits(sources) == ("A; B", "free")
+    assert describe_imagery(sources[2]) == {"path": str(tmp_path / "b.tif"), "crs": EAST, "attribution": "A"}
+    assert describe_imagery(sources[1])["grid"] == "kakao"
+
+
+def test_real_tiles_of_two_levels_agree() -> None:
+    """Drone imagery published at z20 and z21: drawn on one lattice in UTM they agree best without any shift."""
+    home = Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).parents[2].parent / "shared/data"))
+    folder = home / "training-kampala/images"
+    if not folder.is_dir():
+        pytest.skip(f"no real tiles in {folder}")
+    grid = WebMercatorGrid()
+    fine, coarse = (TileFolder(folder, grid, z, "OAM-{x}-{y}-{z}.png") for z in (21, 20))
+    centre = grid.tile_bounds((1238454, 1046531), 21)
+    x, y = transformer("EPSG:3857", "EPSG:32636").transform(centre[0], centre[1])
+    box = lattice((x - 40, y - 30, x + 40, y + 30), "EPSG:32636", 0.15)
+    a, known_a = mosaic_to_lattice(fine, box)
+    b, known_b = mosaic_to_lattice(coarse, box)
+    # The publisher left single pixels transparent.
+    assert known_a.mean() > 0.999
+    assert known_b.mean() > 0.999
+    grey_a, grey_b = a.mean(axis=-1), b.mean(axis=-1)
+    error = {
+        (dr, dc): np.abs(grey_a - np.roll(grey_b, (dr, dc), (0, 1)))[3:-3, 3:-3].mean()
+        for dr in (-1, 0, 1)
+        for dc in (-1, 0, 1)
+    }
+    assert min(error, key=error.__getitem__) == (0, 0)
+    assert error[0, 0] < 0.7 * min(e for shift, e in error.items() if shift != (0, 0))

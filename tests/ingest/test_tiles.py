@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
 import os
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from brmgeo.errors import InputError, MissingInputError, NetworkError, SettingsError
+from brmgeo.errors import InputError, MissingInputError, NetworkError, SettingsError, WorkflowError
 from brmgeo.geo.tilegrid import KakaoGrid, Tile, WebMercatorGrid
 from brmgeo.ingest.tiles import MBTiles, TileFolder, TileService, decode_tile, describe, ensure_tiles
 
@@ -278,6 +279,29 @@ def test_one_service_one_cache(tmp_path: Path) -> None:
         other = TileService(server.url + "/other/{z}/{x}/{y}.png", GRID, 3, tmp_path)
         with pytest.raises(SettingsError, match="cache folder of its own"):
             fill(other)
+
+
+def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk and a folder that is a file end the download in one line, at once, without half tiles."""
+    (tmp_path / "file").write_bytes(b"")
+    with tile_server() as server:
+        with pytest.raises(WorkflowError, match=r"cannot write tile cache .*file"):
+            fill(service(server, tmp_path / "file"))
+        fill(service(server, tmp_path / "c", missing_ok=1.0))
+        for path in (tmp_path / "c").rglob("*.png"):
+            path.unlink()
+        server.paths.clear()
+
+        def full(_: int) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(WorkflowError, match=r"No space left on device; free some space") as caught:
+            fill(service(server, tmp_path / "c", max_connections=2))
+        assert "\n" not in str(caught.value)
+        assert len(server.paths) <= 4
+    assert not list((tmp_path / "c").rglob("*.png"))
+    assert not left_overs(tmp_path)
 
 
 def test_service_settings_are_checked(tmp_path: Path) -> None:
