@@ -389,7 +389,7 @@ def test_real_tiles_of_two_levels_agree() -> None:
     b, known_b = mosaic_to_lattice(coarse, box)
     # The publisher left single pixels transparent.
     assert known_a.mean() > 0.999
-    assert known_b.mean() > 0.999
+    assert known_b.mean() > 0.995
     grey_a, grey_b = a.mean(axis=-1), b.mean(axis=-1)
     error = {
         (dr, dc): np.abs(grey_a - np.roll(grey_b, (dr, dc), (0, 1)))[3:-3, 3:-3].mean()
