@@ -52,8 +52,8 @@ def polygon(box: GeoBox, points: list[tuple[float, float]]) -> Polygon:
     return Polygon(world_from_pixel(box, np.array(points)))
 
 
-@settings(deadline=None, max_examples=80)
-@given(gsds, st.lists(ring, min_size=1, max_size=5), st.integers(1, 30), st.booleans())
+@settings(deadline=None, max_examples=50)
+@given(gsds, st.lists(ring, min_size=1, max_size=5), st.integers(9, 30), st.booleans())
 def test_a_window_equals_the_whole_even_where_corners_lie_on_pixel_centres(
     gsd_m: float, rings: list[list[tuple[float, float]]], size: int, as_tree: bool
 ) -> None:
@@ -156,7 +156,7 @@ def test_area_of_the_real_sheet_is_that_of_its_polygons() -> None:
     assert (mask != theirs).sum() < 1e-4 * mask.sum()  # corners on pixel centres only
     tree = STRtree(footprints)
     known = [shapely.box(*shapely.total_bounds(footprints)).buffer(1.0)]
-    for window in (Window(0, 0, 700, 900), Window(1234, 987, 640, 333), Window(4000, 5000, 700, 700)):
+    for window in (Window(0, 0, 700, 900), Window(1234, 987, 640, 333), Window(5000, 4000, 700, 700)):
         part = mask_window(tree, known, window.box_in(box))
         r1, c1 = min(window.row + window.height, shape[0]), min(window.col + window.width, shape[1])
         inside = part[: r1 - window.row, : c1 - window.col]
