@@ -175,9 +175,19 @@ def _wanted_layers(layers: Sequence[str]) -> dict[bytes, str]:
             )
         spellings = {code, code.removeprefix("B001")} if re.fullmatch(r"B001411\d", code) else {code}
         for spelling in spellings:
-            wanted[spelling.encode("utf-8")] = code
-            wanted[spelling.encode("cp949", errors="replace")] = code
+            # UTF-8 from R2007 on, a code page or \U+ escapes before; bytes are compared in ASCII upper case.
+            for text in (
+                spelling.encode("utf-8"),
+                spelling.encode("cp949", errors="replace"),
+                _escaped(spelling),
+            ):
+                wanted[text.upper()] = code
     return wanted
+
+
+def _escaped(name: str) -> bytes:
+    """A name as code pages that lack its letters write it: U+AC74 becomes ``\\U+AC74``."""
+    return "".join(c if c.isascii() else f"\\U+{ord(c):04X}" for c in name).encode("ascii")
 
 
 def _dxf_text(path: Path) -> bytes:
@@ -630,7 +640,7 @@ def flatten_bulges(
         b = float(bulge[i])
         p, q = xy[i], xy[(i + 1) % n]
         chord = float(np.hypot(*(q - p)))
-        if b == 0.0 or chord == 0.0:
+        if abs(b) * chord < 2e-6:  # bends by less than a thousandth of a millimetre
             continue
         angle = 4.0 * math.atan(b)
         radius = chord * (1.0 + b * b) / (4.0 * abs(b))
@@ -646,7 +656,8 @@ def flatten_bulges(
 
 
 def _arc_steps(radius: float, angle: float, sagitta_m: float) -> int:
-    return max(2, math.ceil(angle / (2.0 * math.acos(max(1.0 - sagitta_m / radius, 0.0)))))
+    # 4 asin sqrt(s / 2r) is 2 acos(1 - s / r) without its loss of digits for flat arcs.
+    return max(2, math.ceil(angle / (4.0 * math.asin(math.sqrt(min(sagitta_m / (2.0 * radius), 0.5))))))
 
 
 def _simple(

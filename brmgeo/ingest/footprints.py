@@ -62,8 +62,8 @@ class Footprints:
 
     Attributes:
         frame: GeoDataFrame in the region's CRS with COLUMNS: ``geometry`` valid polygons; ``layer`` (DXF layer or the
-            file's layer name); ``kind`` (see dxf.KIND_OF_LAYER; "" when unknown); ``floors`` Int32, missing when unknown; ``handle``
-            (DXF handle or feature number from 1); ``source`` file name; ``sheet`` number or "".
+            file's layer name); ``kind`` (see dxf.KIND_OF_LAYER; "" when unknown); ``floors`` Int32, missing when
+            unknown; ``handle`` (DXF handle or feature number from 1); ``source`` file name; ``sheet`` number or "".
         sheets: GeoDataFrame with SHEET_COLUMNS, one row a file: where the file says what is built, and by what ``outline``
             that is known: "neatline", "number" (the sheet number's cell) or "extent" (only the data's bounds).
         repairs: every repair, x and y in the region's CRS.
@@ -384,8 +384,8 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
                 _check_shapefile(path)
                 if encoding is None and not path.with_suffix(".cpg").exists():
                     encoding = "EUC-KR"
-            layer = layer or _only_layer(path)
             with _gdal_option("SHAPE_RESTORE_SHX", "YES" if os.access(path.parent, os.W_OK) else "NO"):
+                layer = layer or _only_layer(path)
                 frame = pyogrio.read_dataframe(path, layer=layer, encoding=encoding, on_invalid="ignore")
     except InputError:
         raise

@@ -1,0 +1,369 @@
+"""Vector footprints: one town through every format and CRS, the CRS check, merging at sheet edges, and the GeoPackage."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from pathlib import Path
+
+import ezdxf
+import geopandas as gpd
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from shapely import affinity
+
+from brmgeo.errors import CrsError, InputError, MissingInputError, WorkflowError
+from brmgeo.export.footprints import write_footprints_gpkg
+from brmgeo.geo.sheets import sheet_extent, sheet_polygon
+from brmgeo.ingest.footprints import COLUMNS, combine, merge_at_edges, read_footprints
+from brmgeo.ingest.repair import Repair
+
+REAL = (
+    Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[2] / "../shared/data")) / "ngii"
+)
+CRS = "EPSG:5187"
+NUMBER, EAST_OF_IT = "36914093", "36914094"
+
+
+def town(n: int = 40, seed: int = 3) -> gpd.GeoDataFrame:
+    """Turned rectangles, some with a courtyard, none touching, inside sheet 36914093."""
+    rng = np.random.default_rng(seed)
+    left, bottom, *_ = sheet_extent(NUMBER, CRS)
+    shapes = []
+    for k in range(n):
+        x, y = left + 200 + 60 * (k % 20), bottom + 200 + 60 * (k // 20)
+        w, h = rng.uniform(6, 20, 2)
+        shape = shapely.box(x, y, x + w, y + h)
+        if k % 7 == 0:
+            shape = shape.difference(shapely.box(x + 2, y + 2, x + w - 2, y + h - 2))
+        shapes.append(affinity.rotate(shape, rng.uniform(0, 90)))
+    kinds = ["아파트", "일반주택", "무벽건물", "온실"]
+    return gpd.GeoDataFrame(
+        {"종류": [kinds[k % 4] for k in range(n)], "층수": [k % 5 for k in range(n)]},
+        geometry=shapes,
+        crs=CRS,
+    )
+
+
+def write(frame: gpd.GeoDataFrame, path: Path) -> Path:
+    if path.suffix == ".parquet":
+        frame.to_parquet(path)
+    elif path.suffix == ".shp":
+        pyogrio.write_dataframe(frame, path, encoding="EUC-KR")
+    else:
+        pyogrio.write_dataframe(frame, path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["t.gpkg", "t.geojson", "t.shp", "t.parquet", "t.fgb"])
+@pytest.mark.parametrize("crs", [CRS, "EPSG:4326", "EPSG:5181", "EPSG:32652"])
+def test_one_town_through_every_format_and_crs(tmp_path, name, crs):
+    frame = town()
+    if name == "t.geojson" and crs != "EPSG:4326":
+        crs = "EPSG:4326"
+    kwargs = {"COORDINATE_PRECISION": "10"} if name == "t.geojson" else {}
+    path = tmp_path / name
+    if kwargs:
+        pyogrio.write_dataframe(frame.to_crs(crs), path, **kwargs)
+    else:
+        write(frame.to_crs(crs), path)
+    read = read_footprints(path, CRS)
+    assert list(read.frame.columns) == list(COLUMNS)
+    assert read.frame.crs == CRS
+    assert read.counts["footprints"] == len(frame)
+    # FlatGeobuf orders features along a curve of its own.
+    order = np.array([int(h) for h in read.frame.handle]) - 1 if name != "t.fgb" else None
+    if order is not None:
+        far = shapely.hausdorff_distance(read.frame.geometry.values, frame.geometry.values[order])
+        assert far.max() < (1e-9 if crs == CRS else 2e-3)
+        assert [len(shape.interiors) for shape in read.frame.geometry] == [
+            len(s.interiors) for s in frame.geometry
+        ]
+        assert list(read.frame.kind[:4]) == ["apartment", "house", "wall-less", "greenhouse"]
+        assert read.frame.floors[1:5].tolist() == [1, 2, 3, 4]
+        assert read.frame.floors.isna().sum() == 8
+    assert read.frame.area.sum() == pytest.approx(frame.area.sum(), rel=1e-6)
+
+
+def test_attributes_of_your_own(tmp_path):
+    frame = town(4).rename(columns={"종류": "use", "층수": "storeys"})
+    frame["storeys"] = ["3층", None, "x", "12"]
+    path = write(frame, tmp_path / "t.gpkg")
+    read = read_footprints(path, CRS, kind_column="use", floors_column="storeys")
+    assert list(read.frame.kind) == ["apartment", "house", "wall-less", "greenhouse"]
+    assert read.frame.floors.fillna(-1).tolist() == [3, -1, -1, 12]
+    with pytest.raises(InputError, match=r"has no column 'art'; there are use, storeys"):
+        read_footprints(path, CRS, kind_column="art")
+
+
+def test_faults_are_repaired_and_told(tmp_path):
+    shapes = list(town(30).geometry)
+    bow = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
+    x, y, *_ = shapes[0].bounds
+    shapes += [affinity.translate(bow, x, y + 500), shapes[3], shapes[3].reverse(), None]
+    path = write(gpd.GeoDataFrame(geometry=shapes, crs=CRS), tmp_path / "t.gpkg")
+    read = read_footprints(path, CRS)
+    assert {k: v for k, v in read.counts.items() if k.startswith("repair")} == {
+        "repair_bow_tie": 1,
+        "repair_duplicate": 2,
+        "repair_unreadable": 1,
+    }
+    assert [r.handle for r in read.repairs if r.kind == "bow_tie"] == ["31"]
+    assert len(read.frame) == 32
+    with pytest.raises(InputError, match="1 of 34 outlines"):
+        read_footprints(path, CRS, max_dropped_share=0.01)
+
+
+def test_lines_heights_multipolygons_and_points(tmp_path):
+    a, b, c = list(town(3, seed=5).geometry[[1, 2]]), *town(12).geometry[[8, 9]]
+    shapes = [
+        shapely.MultiPolygon(a),
+        shapely.force_3d(b, 12.0),
+        shapely.LineString(c.exterior.coords),
+        shapely.Point(c.centroid),
+    ]
+    path = tmp_path / "t.geojson"
+    gpd.GeoDataFrame(geometry=shapes, crs=CRS).to_crs(4326).to_file(path, COORDINATE_PRECISION=10)
+    read = read_footprints(path, CRS)
+    assert len(read.frame) == 4
+    assert read.counts["other_entities"] == 1
+    assert not read.frame.has_z.any()
+    assert list(read.frame.handle) == ["1", "1", "2", "3"]
+
+
+def test_a_shapefile_without_prj_wants_a_crs(tmp_path):
+    path = write(town(), tmp_path / "t.shp")
+    path.with_suffix(".prj").unlink()
+    with pytest.raises(CrsError, match=r"t\.shp: .*no t\.prj beside it.*--crs EPSG:5187"):
+        read_footprints(path, CRS)
+    assert len(read_footprints(path, CRS, source_crs=CRS).frame) == 40
+
+
+def test_a_shapefile_without_dbf_and_shx(tmp_path):
+    path = write(town(), tmp_path / "t.shp")
+    path.with_suffix(".dbf").unlink()
+    path.with_suffix(".shx").unlink()
+    assert read_footprints(path, CRS).frame.area.sum() == pytest.approx(town().area.sum())
+
+
+@pytest.mark.parametrize("name", ["t.gpkg", "t.geojson", "t.shp", "t.parquet"])
+def test_damaged_files_are_refused_in_one_line(tmp_path, name):
+    path = write(town(), tmp_path / name)
+    data = path.read_bytes()
+    for broken in (data[: len(data) // 2], b"", bytes(range(256)) * 20):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match="^" + name.replace(".", r"\.")) as caught:
+            read_footprints(path, CRS)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(MissingInputError, match="no such file"):
+        read_footprints(tmp_path / "nowhere.gpkg", CRS)
+
+
+def test_a_file_with_several_layers_wants_one_named(tmp_path):
+    path = tmp_path / "t.gpkg"
+    pyogrio.write_dataframe(town(), path, layer="a")
+    pyogrio.write_dataframe(town(5), path, layer="b", append=True)
+    with pytest.raises(InputError, match="layers a, b: say which"):
+        read_footprints(path, CRS)
+    assert len(read_footprints(path, CRS, layer="b").frame) == 5
+
+
+def test_a_wrong_crs_is_refused(tmp_path):
+    frame = town()
+    wrong = frame.set_crs("EPSG:5186", allow_override=True)
+    path = write(wrong, tmp_path / f"{NUMBER}.gpkg")
+    with pytest.raises(CrsError, match=r"EPSG:5187 fits \(the stated one would put them 180\.\d km off\)"):
+        read_footprints(path)
+    assert len(read_footprints(path, source_crs=CRS, crs=CRS).frame) == 40
+    with pytest.raises(CrsError, match="needs a projected CRS"):
+        read_footprints(write(frame, tmp_path / "t.gpkg"), "EPSG:4326")
+
+
+def sheet_dxf(
+    path: Path, shapes, number: str, crs: str = CRS, neatline: bool = True, shift=(0.0, 0.0)
+) -> Path:
+    """The part of the shapes that lies on a sheet, cut at its neatline and rounded to millimetres."""
+    doc = ezdxf.new("R2010", units=0)
+    cell = sheet_polygon(number, crs)
+    for shape in shapes:
+        for part in shapely.get_parts(shape.intersection(cell)):
+            for ring in (part.exterior, *part.interiors):
+                xy = np.round(np.array(ring.coords)[:-1], 3) + shift
+                doc.modelspace().add_lwpolyline(xy.tolist(), close=True, dxfattribs={"layer": "B0014112"})
+    if neatline:
+        xy = np.array(cell.exterior.coords)[:-1] + shift
+        doc.modelspace().add_lwpolyline(xy.tolist(), close=True, dxfattribs={"layer": "H0017334"})
+    doc.saveas(path)
+    return path
+
+
+def test_dxf_sheets_go_through_the_same_door(tmp_path):
+    path = sheet_dxf(tmp_path / f"{NUMBER}.dxf", town().geometry, NUMBER)
+    read = read_footprints(path, CRS)
+    assert read.frame.area.sum() == pytest.approx(town().area.sum(), rel=1e-4)
+    assert read.sheets.loc[0, ["sheet", "outline", "footprints"]].tolist() == [NUMBER, "neatline", 40]
+    assert read.sheets.geometry[0].equals_exact(sheet_polygon(NUMBER, CRS), 1e-3, normalize=True)
+    with pytest.raises(CrsError, match="a DXF does not say its CRS"):
+        read_footprints(path)
+    with pytest.raises(CrsError, match=r"neatline.*EPSG:5187 fits"):
+        read_footprints(path, "EPSG:5183")
+    moved = read_footprints(path, "EPSG:5186", source_crs=CRS)
+    assert moved.frame.crs == "EPSG:5186"
+    back = moved.frame.to_crs(CRS).geometry.values
+    assert shapely.hausdorff_distance(back, read.frame.geometry.values).max() < 1e-6
+
+
+def test_the_neatline_tells_the_old_datum(tmp_path):
+    number = "37705039"
+    old = sheet_dxf(
+        tmp_path / f"{number}.dxf", [sheet_polygon(number, "EPSG:5174").buffer(-900)], number, "EPSG:5174"
+    )
+    assert len(read_footprints(old, "EPSG:5174").frame) == 1
+    # Its few outlines lie inside the sheet either way: only the neatline shows the 313 m.
+    with pytest.raises(CrsError, match=r"neatline.*EPSG:5174 fits.*313 m off"):
+        read_footprints(old, "EPSG:5181")
+
+
+def crossing_town(n: int = 100) -> list[shapely.Polygon]:
+    """Buildings astride the edge between two sheets, no two of them near each other."""
+    rng = np.random.default_rng(8)
+    edge = shapely.get_coordinates(sheet_polygon(NUMBER, CRS).exterior)[16:33]
+    shapes = []
+    for k in range(n):
+        at = edge[0] + (edge[-1] - edge[0]) * (k + 0.5) / n
+        shape = shapely.box(-rng.uniform(2, 9), -rng.uniform(2, 9), rng.uniform(2, 9), rng.uniform(2, 9))
+        shapes.append(affinity.translate(affinity.rotate(shape, rng.uniform(0, 90), origin=(0, 0)), *at))
+    return shapes
+
+
+def test_buildings_cut_at_a_sheet_edge_are_one_again(tmp_path):
+    shapes = crossing_town()
+    parts = [
+        read_footprints(sheet_dxf(tmp_path / f"{number}.dxf", shapes, number), CRS)
+        for number in (NUMBER, EAST_OF_IT)
+    ]
+    assert [len(part.frame) for part in parts] == [100, 100]
+    whole = combine(parts)
+    assert (len(whole.frame), whole.counts["merged_at_edges"]) == (100, 100)
+    assert whole.frame.is_valid.all()
+    assert whole.frame.area.sum() == pytest.approx(sum(part.frame.area.sum() for part in parts), rel=1e-5)
+    order = shapely.STRtree(whole.frame.geometry.values).nearest(shapely.centroid(np.array(shapes)))
+    assert shapely.hausdorff_distance(whole.frame.geometry.values[order], np.array(shapes)).max() < 5e-3
+    assert set(whole.frame.geom_type) == {"Polygon"}
+    assert len(whole.sheets) == 2
+
+
+def test_merging_bears_centimetres_and_no_more(tmp_path):
+    shapes = crossing_town(20)
+    for shift, expected in (((0.03, 0.02), 20), ((0.5, 0.0), 40)):
+        parts = [
+            read_footprints(sheet_dxf(tmp_path / f"{NUMBER}.dxf", shapes, NUMBER), CRS),
+            read_footprints(sheet_dxf(tmp_path / f"{EAST_OF_IT}.dxf", shapes, EAST_OF_IT, shift=shift), CRS),
+        ]
+        whole = combine(parts)
+        assert len(whole.frame) == expected
+        assert whole.frame.area.sum() == pytest.approx(sum(s.area for s in shapes), rel=0.01)
+
+
+def test_only_cut_pieces_are_merged():
+    edge = shapely.box(0, 0, 100, 100), shapely.box(100, 0, 200, 100)
+    boxes = {
+        "left half": (shapely.box(90, 10, 100, 20), "a", "house"),
+        "right half": (shapely.box(100, 10, 110, 20), "b", "house"),
+        "other kind": (shapely.box(100, 20, 110, 30), "b", "greenhouse"),
+        "corner only": (shapely.box(100, 30, 110, 40), "b", "house"),
+        "neighbour, same sheet": (shapely.box(90, 20, 100, 30), "a", "house"),
+        "near the edge": (shapely.box(101, 50, 110, 60), "b", "house"),
+        "opposite it": (shapely.box(90, 50, 99, 60), "a", "house"),
+    }
+    frame = gpd.GeoDataFrame(
+        {
+            "source": [b[1] for b in boxes.values()],
+            "kind": [b[2] for b in boxes.values()],
+            "name": list(boxes),
+        },
+        geometry=[b[0] for b in boxes.values()],
+        crs=CRS,
+    )
+    merged, fewer = merge_at_edges(frame, edge)
+    assert fewer == 1
+    assert list(merged["name"]) == [name for name in boxes if name != "right half"]
+    assert merged.geometry[0].equals(shapely.box(90, 10, 110, 20))
+
+
+def test_a_building_at_the_corner_of_four_sheets():
+    sheets = [shapely.box(x, y, x + 100, y + 100) for x in (0, 100) for y in (0, 100)]
+    house = affinity.rotate(shapely.box(80, 85, 120, 115), 20)
+    frame = gpd.GeoDataFrame(
+        {"source": list("abcd"), "kind": "house"}, geometry=[house.intersection(s) for s in sheets], crs=CRS
+    )
+    merged, fewer = merge_at_edges(frame, sheets)
+    assert (len(merged), fewer) == (1, 3)
+    assert merged.geometry[0].symmetric_difference(house).area < 1e-6
+
+
+def test_what_two_sheets_hold_is_kept_once(tmp_path):
+    frame = town()
+    one = read_footprints(write(frame.iloc[:30], tmp_path / "one.gpkg"), CRS)
+    two = read_footprints(write(frame.iloc[20:], tmp_path / "two.gpkg"), CRS)
+    whole = combine([one, two])
+    assert len(whole.frame) == 40
+    assert whole.counts["duplicates_across_sheets"] == 10
+    assert whole.frame.area.sum() == pytest.approx(frame.area.sum())
+    with pytest.raises(CrsError, match="read all into one crs"):
+        combine([one, read_footprints(tmp_path / "two.gpkg", "EPSG:5186")])
+
+
+def test_the_geopackage_has_its_layers_and_the_same_bytes(tmp_path):
+    whole = combine([read_footprints(write(town(), tmp_path / f"{NUMBER}.gpkg"), CRS)])
+    repairs = [Repair("gap", "1F", "B0014112", 227_100.0, 378_200.0, "ends 0.05 m apart", "a.dxf")]
+    repairs += [Repair("unreadable", "", "x", float("nan"), float("nan"))]
+    paths = [tmp_path / "a.gpkg", tmp_path / "b.gpkg"]
+    for path in paths:
+        write_footprints_gpkg(path, whole.frame, whole.sheets, repairs)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert [name for name, _ in pyogrio.list_layers(paths[0])] == ["footprints", "sheets", "repairs"]
+    back = pyogrio.read_dataframe(paths[0], layer="footprints")
+    assert shapely.equals_exact(back.geometry.values, whole.frame.geometry.values).all()
+    assert back.crs == CRS
+    assert pyogrio.read_dataframe(paths[0], layer="repairs").kind.tolist() == ["gap"]
+    assert pyogrio.read_dataframe(paths[0], layer="sheets").sheet.tolist() == [NUMBER]
+    with sqlite3.connect(paths[0]) as database:
+        assert database.execute("pragma integrity_check").fetchone() == ("ok",)
+    database.close()
+    # A second read of what was written gives the same footprints.
+    assert len(read_footprints(paths[0], CRS).frame) == 40
+    with pytest.raises(WorkflowError, match="cannot be written"):
+        write_footprints_gpkg(tmp_path / "no" / "a.gpkg", whole.frame, whole.sheets)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"{NUMBER}.gpkg", "a.gpkg", "b.gpkg"]
+
+
+def test_no_footprints_at_all(tmp_path):
+    doc = ezdxf.new("R2010")
+    doc.saveas(tmp_path / f"{NUMBER}.dxf")
+    whole = combine([read_footprints(tmp_path / f"{NUMBER}.dxf", CRS)])
+    assert (len(whole.frame), len(whole.sheets)) == (0, 1)
+    write_footprints_gpkg(tmp_path / "e.gpkg", whole.frame, whole.sheets, whole.repairs)
+    back = read_footprints(tmp_path / "e.gpkg", CRS, layer="footprints")
+    assert len(back.frame) == 0
+
+
+def test_the_real_sheet_is_one_in_all_its_formats(tmp_path):
+    if not REAL.is_dir():
+        pytest.skip("real data ../shared/data/ngii is not there (BRMGEO_REAL_DATA)")
+    for part in REAL.glob("N3A_B0010000.*"):
+        shutil.copy(part, tmp_path)
+    files = [REAL / "36914093_buildings.gpkg", REAL / "36914093_r12.dxf", REAL / "36914093_r2018.dxf"]
+    reads = [read_footprints(path, CRS) for path in (*files, tmp_path / "N3A_B0010000.shp")]
+    keys = [sorted(shapely.to_wkb(shapely.normalize(read.frame.geometry.values))) for read in reads]
+    assert keys[0] == keys[1] == keys[2] == keys[3]
+    for read in reads:
+        assert len(read.frame) == 2536
+        assert read.frame.area.sum() == pytest.approx(354_361, abs=0.5)
+        assert read.sheets.loc[0, ["sheet", "outline"]].tolist() == [NUMBER, "number"]
+    kinds = reads[0].frame.kind.value_counts()
+    assert kinds.equals(reads[1].frame.kind.value_counts())
+    assert kinds["house"] == 551
