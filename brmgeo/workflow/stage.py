@@ -47,9 +47,9 @@ class Stage:
         name: lower-case word; the folder of its artifacts in the store.
         version: raised by hand whenever the same inputs and settings would give another result.
         run: ``run(inputs, out, settings, map) -> facts``. ``inputs`` maps names to paths (folders of upstream
-            artifacts, source files or folders), ``out`` is an empty folder, named by the artifact's key, that takes the outputs, ``settings`` is a
-            plain dict as JSON would return it, ``map`` fans out over workers (who get paths and windows, and open
-            their own handles). The returned facts are JSON-able and go into the record.
+            artifacts, source files or folders), ``out`` is an empty folder, named by the artifact's key, that takes
+            the outputs, ``settings`` is a plain dict as JSON would return it, ``map`` fans out over workers (who get
+            paths and windows, and open their own handles). The returned facts are JSON-able and go into the record.
     """
 
     name: str

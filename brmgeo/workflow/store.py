@@ -3,7 +3,7 @@
 Layout below the root::
 
     artifacts/STAGE/KEY/    a finished stage: its outputs and provenance.json; never changed once there
-    tmp/ID/                 work in progress: lock (held while its owner lives) and out/ (becomes the artifact)
+    tmp/ID/                 work in progress: lock (held while its owner lives) and KEY/ (becomes the artifact)
     latest/REGION/LABEL.json   the most recent record of each step of a region, for ``status`` and ``why``
     locks/REGION.lock       held by the run that works on a region
     digests.json            content hashes of source files by path, size, times and inode
