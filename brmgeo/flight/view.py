@@ -38,15 +38,19 @@ def _resample(image, scale, rot, agl, lens, bend, max_r2, reach2, top, left, gsd
             count = 0
             for a in range(samples):
                 f = top - i * gsd - (a + 0.5) * step
+                ray_x = f * rot[0, 0] - agl * rot[2, 0]
+                ray_y = f * rot[0, 1] - agl * rot[2, 1]
+                ray_z = f * rot[0, 2] - agl * rot[2, 2]
                 for b in range(samples):
                     s = left - j * gsd - (b + 0.5) * step
                     if f * f + s * s > reach2:
                         continue
-                    z = f * rot[0, 2] + s * rot[1, 2] - agl * rot[2, 2]
+                    z = ray_z + s * rot[1, 2]
                     if z <= 1e-9:
                         continue
-                    x = (f * rot[0, 0] + s * rot[1, 0] - agl * rot[2, 0]) / z
-                    y = (f * rot[0, 1] + s * rot[1, 1] - agl * rot[2, 1]) / z
+                    inverse = 1.0 / z
+                    x = (ray_x + s * rot[1, 0]) * inverse
+                    y = (ray_y + s * rot[1, 1]) * inverse
                     if bent:
                         r2 = x * x + y * y
                         if r2 > max_r2:
@@ -59,16 +63,25 @@ def _resample(image, scale, rot, agl, lens, bend, max_r2, reach2, top, left, gsd
                     v = y * fy + cy
                     if not (u >= -0.5 and v >= -0.5 and u < width - 0.5 and v < height - 0.5):
                         continue
-                    u0 = math.floor(u)
-                    v0 = math.floor(v)
+                    # Both are above -1: cutting off the fraction of one more is a floor, and a cheap one.
+                    u0 = int(u + 1.0) - 1
+                    v0 = int(v + 1.0) - 1
                     du = u - u0
                     dv = v - v0
                     u1 = min(u0 + 1, width - 1)
                     v1 = min(v0 + 1, height - 1)
                     u0 = max(u0, 0)
                     v0 = max(v0, 0)
-                    upper = image[v0, u0] * (1.0 - du) + image[v0, u1] * du
-                    lower = image[v1, u0] * (1.0 - du) + image[v1, u1] * du
+                    p00 = image[v0, u0]
+                    p01 = image[v0, u1]
+                    p10 = image[v1, u0]
+                    p11 = image[v1, u1]
+                    if p00 == p11 and p01 == p10 and p00 == p01:  # nearly everywhere in a mask
+                        total += p00
+                        count += 1
+                        continue
+                    upper = p00 * (1.0 - du) + p01 * du
+                    lower = p10 * (1.0 - du) + p11 * du
                     value = upper * (1.0 - dv) + lower * dv
                     if value == value:  # NaN marks what a probability image does not know
                         total += value
