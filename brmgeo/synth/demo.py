@@ -15,7 +15,7 @@ from brmgeo.synth.town import generate_town
 DEMO_CRS = "EPSG:5187"
 DEMO_BOUNDS: Bounds = (194430.0, 444640.0, 196630.0, 447380.0)
 """2.20 x 2.74 km about the edge at 128.95 E between the two sheets; the town is invented, the place only lends coordinates."""
-DEMO_SHEETS = ("36808047", "36808048")
+DEMO_SHEETS = ("36808058", "36808059")
 DEMO_SEED = 1
 
 
@@ -32,5 +32,7 @@ def make_demo(
     manifest["buildings"] = len(town.buildings)
     manifest["area_m2"] = town.built_area_m2()
     manifest["tiles"] = {"grid": "kakao", "level": level, "count": count, "template": "L{z}/{y}/{x}.jpg"}
-    (out_dir / "manifest.json").write_text(json.dumps(manifest, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+    (out_dir / "manifest.json").write_text(
+        json.dumps(manifest, ensure_ascii=False, indent=1) + "\n", encoding="utf-8"
+    )
     return manifest

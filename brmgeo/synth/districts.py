@@ -53,7 +53,14 @@ _SHED: tuple[Colour, ...] = (
     (70, 112, 160), (58, 100, 146), (164, 168, 170), (186, 188, 186), (148, 150, 150), (118, 122, 126),
     (90, 130, 112), (172, 118, 96), (136, 86, 74), (128, 96, 82),
 )  # fmt: skip
-_PALE: tuple[Colour, ...] = ((196, 204, 206), (172, 184, 192), (150, 162, 160), (120, 150, 176), (188, 186, 174), (104, 138, 118))
+_PALE: tuple[Colour, ...] = (
+    (196, 204, 206),
+    (172, 184, 192),
+    (150, 162, 160),
+    (120, 150, 176),
+    (188, 186, 174),
+    (104, 138, 118),
+)
 
 
 @dataclass(frozen=True)
@@ -110,13 +117,38 @@ def _house_shape(rng: np.random.Generator, x: float, y: float, w: float, d: floa
     form = rng.random()
     a, b = rng.uniform(0.3, 0.55), rng.uniform(0.3, 0.5)
     if form < 0.3 and min(w, d) > 6:  # L
-        local = [[-w, -d], [w, -d], [w, d * (1 - 2 * b)], [w * (1 - 2 * a), d * (1 - 2 * b)], [w * (1 - 2 * a), d], [-w, d]]
+        local = [
+            [-w, -d],
+            [w, -d],
+            [w, d * (1 - 2 * b)],
+            [w * (1 - 2 * a), d * (1 - 2 * b)],
+            [w * (1 - 2 * a), d],
+            [-w, d],
+        ]
     elif form < 0.52 and w > 7:  # porch
         p, q, r = rng.uniform(-0.7, 0.0), rng.uniform(0.1, 0.7), rng.uniform(1.0, 2.2) * 2
-        local = [[-w, -d], [w * p, -d], [w * p, -d - r], [w * q, -d - r], [w * q, -d], [w, -d], [w, d], [-w, d]]
+        local = [
+            [-w, -d],
+            [w * p, -d],
+            [w * p, -d - r],
+            [w * q, -d - r],
+            [w * q, -d],
+            [w, -d],
+            [w, d],
+            [-w, d],
+        ]
     elif form < 0.64 and min(w, d) > 7:  # two steps
         p, r = rng.uniform(-0.3, 0.3), rng.uniform(0.8, 2.0) * 2
-        local = [[-w, -d + r], [w * p, -d + r], [w * p, -d], [w, -d], [w, d - r * 0.6], [w * 0.5, d - r * 0.6], [w * 0.5, d], [-w, d]]
+        local = [
+            [-w, -d + r],
+            [w * p, -d + r],
+            [w * p, -d],
+            [w, -d],
+            [w, d - r * 0.6],
+            [w * 0.5, d - r * 0.6],
+            [w * 0.5, d],
+            [-w, d],
+        ]
     corners = np.array(local) / 2
     if rng.random() < 0.5:
         corners[:, 0] *= -1
@@ -170,13 +202,19 @@ def _house(
     return out
 
 
-def make_streets(ground: Ground, zones: BaseGeometry, rng: np.random.Generator, style: TownStyle) -> list[Road]:
+def make_streets(
+    ground: Ground, zones: BaseGeometry, rng: np.random.Generator, style: TownStyle
+) -> list[Road]:
     """The town's crooked grid of streets about its centre, outside ``zones`` and the river."""
     radius = ground.town_radius_m
     warp = Waves(rng, (160.0, 600.0), 12), Waves(rng, (160.0, 600.0), 12)
     angle = np.linspace(0, 2 * math.pi, 90, endpoint=False)
-    blob = radius * (1 + 0.13 * np.sin(3 * angle + rng.uniform(0, 6)) + 0.09 * np.sin(5 * angle + rng.uniform(0, 6)))
-    outline = Polygon(ground.centre.world(np.column_stack([blob * np.cos(angle) * 1.12, blob * np.sin(angle) * 0.9])))
+    blob = radius * (
+        1 + 0.13 * np.sin(3 * angle + rng.uniform(0, 6)) + 0.09 * np.sin(5 * angle + rng.uniform(0, 6))
+    )
+    outline = Polygon(
+        ground.centre.world(np.column_stack([blob * np.cos(angle) * 1.12, blob * np.sin(angle) * 0.9]))
+    )
     outline = outline.difference(shapely.union_all([ground.bank.buffer(8.0), zones]))
     lines: list[LineString] = []
     s = np.arange(-1.3 * radius, 1.3 * radius, 8.0)
@@ -219,7 +257,9 @@ def town_blocks(ground: Ground, roads: list[Road], style: TownStyle) -> list[Pol
     return [b for b in blocks if b.area < 30_000 and b.buffer(-6).area > 0]
 
 
-def fill_block(block: Polygon, ground: Ground, rng: np.random.Generator, style: TownStyle, plan: Plan) -> None:
+def fill_block(
+    block: Polygon, ground: Ground, rng: np.random.Generator, style: TownStyle, plan: Plan
+) -> None:
     """Shops along the through road, dense houses and row houses elsewhere, with some plots left empty."""
     distance = block.distance(ground.arterial)
     from_centre = block.centroid.distance(Point(ground.centre.x, ground.centre.y)) / ground.town_radius_m
@@ -251,7 +291,9 @@ def fill_block(block: Polygon, ground: Ground, rng: np.random.Generator, style: 
                     elif rng.random() < 0.07:
                         lot = _shop(rng, p, angle, plan)
                     else:
-                        plan.proposals += _house(rng, style, p.x, p.y, angle + rng.choice([0, math.pi]), lot, True)
+                        plan.proposals += _house(
+                            rng, style, p.x, p.y, angle + rng.choice([0, math.pi]), lot, True
+                        )
                 s += lot
         depth += float(rng.uniform(15, 19))
 
@@ -264,10 +306,14 @@ def _shop(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> float
     colour = _pick(rng, _FLAT) if roof == "flat" else _pick(rng, _SHED)
     lot = rectangle(p.x, p.y, w + 2, d + 6, angle)
     ground = Area(lot, str(rng.choice(["concrete", "asphalt"])), angle, float(rng.normal()))
-    plan.proposals.append(Proposal(Building(shape, OTHER, floors, 3.5 * floors + 1, roof, colour), 0.7, (ground,)))
+    plan.proposals.append(
+        Proposal(Building(shape, OTHER, floors, 3.5 * floors + 1, roof, colour), 0.7, (ground,))
+    )
     if rng.random() < 0.55:
         back = Frame(p.x, p.y, angle).world(np.array([[rng.uniform(-3, 3), d / 2 + 4.5]]))[0]
-        shed = rectangle(float(back[0]), float(back[1]), float(rng.uniform(3, 9)), float(rng.uniform(2.5, 5)), angle)
+        shed = rectangle(
+            float(back[0]), float(back[1]), float(rng.uniform(3, 9)), float(rng.uniform(2.5, 5)), angle
+        )
         plan.proposals.append(Proposal(Building(shed, TEMPORARY, 1, 2.8, "shed", _pick(rng, _SHED)), 0.4))
     return w + float(rng.choice([rng.uniform(1.5, 4), rng.uniform(6, 18)], p=[0.75, 0.25]))
 
@@ -281,7 +327,13 @@ def _row_house(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> 
     plan.proposals.append(Proposal(building, 2.0, (lot,)))
     side = Frame(p.x, p.y, angle).world(np.array([[rng.uniform(-6, 6), -d / 2 - 2.2]]))[0]
     for j in range(int(rng.integers(1, 3))):
-        plan.cars.append((float(side[0]) + j * 2.7 * math.cos(angle), float(side[1]) + j * 2.7 * math.sin(angle), angle + math.pi / 2))
+        plan.cars.append(
+            (
+                float(side[0]) + j * 2.7 * math.cos(angle),
+                float(side[1]) + j * 2.7 * math.sin(angle),
+                angle + math.pi / 2,
+            )
+        )
     return w + float(rng.uniform(5, 9))
 
 
@@ -308,12 +360,21 @@ def make_village(
     lanes.append(main)
     for _ in range(int(rng.integers(3, 7))):
         p = main.interpolate(float(rng.uniform(0.05, 0.95)), normalized=True)
-        lanes.append(wander(p.x, p.y, direction + float(rng.choice([-1, 1])) * rng.uniform(1.2, 1.9), float(rng.uniform(45, 125))))
+        lanes.append(
+            wander(
+                p.x,
+                p.y,
+                direction + float(rng.choice([-1, 1])) * rng.uniform(1.2, 1.9),
+                float(rng.uniform(45, 125)),
+            )
+        )
     plan.roads += [Road(lane, 3.2 + (1.2 if i == 0 else 0.0), "lane") for i, lane in enumerate(lanes)]
     nearest = min((ground.arterial, ground.cross, *ground.levees), key=lambda r: r.distance(Point(x, y)))
     q = nearest.interpolate(nearest.project(Point(x, y)))
     link = np.linspace(0, 1, 12)[:, None] * np.array([[q.x - x, q.y - y]]) + np.array([[x, y]])
-    link[1:-1] += np.cumsum(rng.normal(0, 2.5, (10, 2)), axis=0) * np.sin(np.linspace(0, math.pi, 10))[:, None]
+    link[1:-1] += (
+        np.cumsum(rng.normal(0, 2.5, (10, 2)), axis=0) * np.sin(np.linspace(0, math.pi, 10))[:, None]
+    )
     if nearest.distance(Point(x, y)) < 700:
         plan.roads.append(Road(LineString(link), 4.2, "lane"))
     keep = 0.82 * style.density
@@ -329,7 +390,9 @@ def make_village(
                 h = math.atan2(q.y - p.y, q.x - p.x) + side * math.pi / 2
                 off = float(rng.uniform(9.5, 16))
                 angle = face + rng.normal(0, 0.16) + (math.pi / 2 if rng.random() < 0.17 else 0.0)
-                placed += _house(rng, style, p.x + off * math.cos(h), p.y + off * math.sin(h), angle, 16.0, False)
+                placed += _house(
+                    rng, style, p.x + off * math.cos(h), p.y + off * math.sin(h), angle, 16.0, False
+                )
             s += float(rng.uniform(15, 23))
         if i == 0 and rng.random() < 0.8:
             p = lane.interpolate(0.5, normalized=True)
@@ -346,10 +409,19 @@ def make_village(
     for _ in range(int(half / 2)):
         lane = lanes[int(rng.integers(len(lanes)))]
         p = lane.interpolate(float(rng.random()), normalized=True)
-        plan.trees.append((p.x + float(rng.normal(0, 17)), p.y + float(rng.normal(0, 17)), float(rng.uniform(1.0, 3.3))))
+        plan.trees.append(
+            (p.x + float(rng.normal(0, 17)), p.y + float(rng.normal(0, 17)), float(rng.uniform(1.0, 3.3)))
+        )
 
 
-def apartment_complex(zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, style: TownStyle, plan: Plan) -> None:
+def apartment_complex(
+    zone: Polygon,
+    frame: Frame,
+    size: tuple[float, float],
+    rng: np.random.Generator,
+    style: TownStyle,
+    plan: Plan,
+) -> None:
     """Parallel slabs that face south or so, car parks between them, a playground, walkway roofs, a small shop."""
     w, h = size
     south = frame.angle_rad
@@ -369,14 +441,25 @@ def apartment_complex(zone: Polygon, frame: Frame, size: tuple[float, float], rn
             length = float(rng.uniform(34, 72))
             floors = int(rng.integers(12, 21)) if tall else int(rng.integers(5, 7))
             x, y = local.world(np.array([[u + length / 2, v + rng.normal(0, 2.2)]]))[0]
-            slab = _slab(rng, float(x), float(y), length, depth + float(rng.normal(0, 0.3)), slab_angle + float(rng.normal(0, 0.006)))
+            slab = _slab(
+                rng,
+                float(x),
+                float(y),
+                length,
+                depth + float(rng.normal(0, 0.3)),
+                slab_angle + float(rng.normal(0, 0.006)),
+            )
             if not inner.contains(slab) or rng.random() > 0.5 + 0.5 * style.density:
                 u += 5.0
                 continue
             u += length + float(rng.uniform(9, 18))
-            building = Building(slab, APARTMENT, floors, 2.85 * floors + 2.0, "apartment", _jitter(rng, tone, 3.0))
+            building = Building(
+                slab, APARTMENT, floors, 2.85 * floors + 2.0, "apartment", _jitter(rng, tone, 3.0)
+            )
             lane_at = local.world(np.array([[u - length / 2 - 12, v - depth / 2 - 11.0]]))[0]
-            park = rectangle(float(lane_at[0]), float(lane_at[1]), length + 6, 15.0, slab_angle).intersection(inner)
+            park = rectangle(float(lane_at[0]), float(lane_at[1]), length + 6, 15.0, slab_angle).intersection(
+                inner
+            )
             grounds = tuple(Area(p, "parking", slab_angle, 0.0) for p in polygons_of(park, 60.0))
             plan.proposals.append(Proposal(building, 6.0, grounds))
             for area in grounds:
@@ -384,18 +467,26 @@ def apartment_complex(zone: Polygon, frame: Frame, size: tuple[float, float], rn
             for t in np.arange(-length / 2, length / 2, 5.5):
                 for off, chance in ((depth / 2 + 3.4, 0.75), (-depth / 2 - 2.6, 0.55)):
                     if rng.random() < chance:
-                        px, py = Frame(float(x), float(y), slab_angle).world(np.array([[t + rng.normal(0, 1), off + rng.normal(0, 0.5)]]))[0]
+                        px, py = Frame(float(x), float(y), slab_angle).world(
+                            np.array([[t + rng.normal(0, 1), off + rng.normal(0, 0.5)]])
+                        )[0]
                         plan.trees.append((float(px), float(py), float(rng.uniform(1.2, 2.6))))
             if rng.random() < 0.6:
                 cx, cy = local.world(np.array([[u + rng.uniform(-30, 0), v - depth / 2 - 4.0]]))[0]
                 roof = rectangle(float(cx), float(cy), float(rng.uniform(12, 30)), 2.6, slab_angle)
-                plan.proposals.append(Proposal(Building(roof, CANOPY, 1, 3.0, "canopy", _pick(rng, _PALE)), 0.4))
+                plan.proposals.append(
+                    Proposal(Building(roof, CANOPY, 1, 3.0, "canopy", _pick(rng, _PALE)), 0.4)
+                )
         v += depth + (float(rng.uniform(34, 44)) if tall else float(rng.uniform(23, 29)))
     for _ in range(4):
         px, py = frame.world(np.array([[rng.uniform(-w, w) * 0.42, rng.uniform(-h, h) * 0.42]]))[0]
-        low = rectangle(float(px), float(py), float(rng.uniform(9, 22)), float(rng.uniform(6, 12)), slab_angle)
+        low = rectangle(
+            float(px), float(py), float(rng.uniform(9, 22)), float(rng.uniform(6, 12)), slab_angle
+        )
         floors = int(rng.integers(1, 4))
-        plan.proposals.append(Proposal(Building(low, OTHER, floors, 3.4 * floors, "flat", _pick(rng, _FLAT)), 3.0))
+        plan.proposals.append(
+            Proposal(Building(low, OTHER, floors, 3.4 * floors, "flat", _pick(rng, _FLAT)), 3.0)
+        )
     px, py = frame.world(np.array([[rng.uniform(-w, w) * 0.35, rng.uniform(-h, h) * 0.35]]))[0]
     plan.grounds.append(Area(Point(px, py).buffer(8.0), "playground", 0.0, float(rng.normal())))
     _edge_trees(zone, rng, plan, 6.0, 0.7)
@@ -409,7 +500,12 @@ def _slab(rng: np.random.Generator, x: float, y: float, length: float, depth: fl
     for c in range(cores):
         at = -length / 2 + (c + 0.5) * unit
         half, out = float(rng.uniform(2.0, 2.7)), float(rng.uniform(1.2, 1.9))
-        north += [[at - half, depth / 2], [at - half, depth / 2 + out], [at + half, depth / 2 + out], [at + half, depth / 2]]
+        north += [
+            [at - half, depth / 2],
+            [at - half, depth / 2 + out],
+            [at + half, depth / 2 + out],
+            [at + half, depth / 2],
+        ]
     step = float(rng.choice([0.0, 0.9, 1.4]))
     cut = -length / 2 + unit * float(rng.integers(1, cores + 1)) if step else 0.0
     south = [[length / 2, -depth / 2]]
@@ -438,27 +534,43 @@ def _edge_trees(zone: Polygon, rng: np.random.Generator, plan: Plan, step: float
     for s in np.arange(0, ring.length, step):
         if rng.random() < share:
             p = ring.interpolate(s + rng.normal(0, 1.0))
-            plan.trees.append((p.x + float(rng.normal(0, 0.6)), p.y + float(rng.normal(0, 0.6)), float(rng.uniform(1.4, 3.2))))
+            plan.trees.append(
+                (
+                    p.x + float(rng.normal(0, 0.6)),
+                    p.y + float(rng.normal(0, 0.6)),
+                    float(rng.uniform(1.4, 3.2)),
+                )
+            )
 
 
-def school(zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, plan: Plan, name: str) -> None:
+def school(
+    zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, plan: Plan, name: str
+) -> None:
     """A school around a courtyard (a ring in a ring), a gym, a walkway roof and the sports ground."""
     w, h = size
     angle = frame.angle_rad
     plan.grounds.append(Area(zone, "concrete", angle, float(rng.normal())))
     bw, bd, wing = float(rng.uniform(50, 64)), float(rng.uniform(34, 44)), float(rng.uniform(9, 11))
-    x, y = frame.world(np.array([[-w / 2 + bw / 2 + rng.uniform(8, 14), h / 2 - bd / 2 - rng.uniform(9, 13)]]))[0]
+    x, y = frame.world(
+        np.array([[-w / 2 + bw / 2 + rng.uniform(8, 14), h / 2 - bd / 2 - rng.uniform(9, 13)]])
+    )[0]
     outer = rectangle(float(x), float(y), bw, bd, angle)
     off = rng.uniform(-1.0, 1.0, 2)
-    inner = rectangle(float(x + off[0]), float(y + off[1]), bw - 2 * wing, bd - 2 * wing + rng.uniform(-2, 2), angle)
+    inner = rectangle(
+        float(x + off[0]), float(y + off[1]), bw - 2 * wing, bd - 2 * wing + rng.uniform(-2, 2), angle
+    )
     ring = Polygon(outer.exterior, [inner.exterior])
     floors = int(rng.integers(3, 5))
     green = (Area(inner, "lawn", angle, 0.3),)
-    plan.proposals.append(Proposal(Building(ring, OTHER, floors, 3.6 * floors + 1, "flat", _pick(rng, _FLAT), name), 4.0, green))
+    plan.proposals.append(
+        Proposal(Building(ring, OTHER, floors, 3.6 * floors + 1, "flat", _pick(rng, _FLAT), name), 4.0, green)
+    )
     plan.names.append((float(x), float(y) - bd / 2 + 4, name))
     c = inner.centroid
     for _ in range(9):
-        plan.trees.append((c.x + float(rng.normal(0, 6)), c.y + float(rng.normal(0, 4)), float(rng.uniform(1.2, 2.6))))
+        plan.trees.append(
+            (c.x + float(rng.normal(0, 6)), c.y + float(rng.normal(0, 4)), float(rng.uniform(1.2, 2.6)))
+        )
     gx, gy = frame.world(np.array([[w / 2 - 24, h / 2 - 24 + rng.uniform(-3, 3)]]))[0]
     gym = rectangle(float(gx), float(gy), float(rng.uniform(27, 33)), float(rng.uniform(20, 24)), angle)
     plan.proposals.append(Proposal(Building(gym, OTHER, 2, 11.0, "metal", _pick(rng, _SHED[:6])), 4.0))
@@ -466,11 +578,15 @@ def school(zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.rando
     walk = rectangle(float(wx), float(wy), 12.0, 2.8, angle)
     plan.proposals.append(Proposal(Building(walk, CANOPY, 1, 3.0, "canopy", _pick(rng, _PALE)), 0.2))
     px, py = frame.world(np.array([[rng.uniform(-4, 4), -h / 2 + (h - bd) / 2 - 6]]))[0]
-    plan.grounds.append(Area(rectangle(float(px), float(py), w - 14, h - bd - 34, angle), "sports", angle, 0.0))
+    plan.grounds.append(
+        Area(rectangle(float(px), float(py), w - 14, h - bd - 34, angle), "sports", angle, 0.0)
+    )
     _edge_trees(zone, rng, plan, 5.5, 0.85)
 
 
-def works(zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, plan: Plan) -> None:
+def works(
+    zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, plan: Plan
+) -> None:
     """Factories and warehouses on concrete, with offices, lean-to roofs and containers."""
     w, h = size
     plan.grounds.append(Area(zone, "concrete", frame.angle_rad, -0.5 + float(rng.normal(0, 0.5))))
@@ -486,11 +602,22 @@ def works(zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random
             hall = _house_shape(rng, float(x), float(y), length, depth - float(rng.uniform(0, 5)), angle)
             u += length + float(rng.uniform(5, 16))
             if inner.contains(hall) and rng.random() < 0.85:
-                plan.proposals.append(Proposal(Building(hall, OTHER, 1, float(rng.uniform(7, 12)), "metal", _pick(rng, _SHED)), 3.0))
+                plan.proposals.append(
+                    Proposal(
+                        Building(hall, OTHER, 1, float(rng.uniform(7, 12)), "metal", _pick(rng, _SHED)), 3.0
+                    )
+                )
             for _ in range(2):
                 bx, by = frame.world(np.array([[u + rng.uniform(-20, 0), v - 4.5 + rng.uniform(-2, 2)]]))[0]
-                box = rectangle(float(bx), float(by), *((6.1, 2.5) if rng.random() < 0.6 else (3.1, 2.4)), angle + float(rng.normal(0, 0.1)))
-                plan.proposals.append(Proposal(Building(box, TEMPORARY, 1, 2.6, "box", _pick(rng, _SHED)), 0.5))
+                box = rectangle(
+                    float(bx),
+                    float(by),
+                    *((6.1, 2.5) if rng.random() < 0.6 else (3.1, 2.4)),
+                    angle + float(rng.normal(0, 0.1)),
+                )
+                plan.proposals.append(
+                    Proposal(Building(box, TEMPORARY, 1, 2.6, "box", _pick(rng, _SHED)), 0.5)
+                )
         v += depth + float(rng.uniform(11, 17))
     c = frame.world(np.array([[rng.uniform(-0.3, 0.3) * w, -h / 2 + 11]]))[0]
     office = rectangle(float(c[0]), float(c[1]), float(rng.uniform(12, 22)), 9.0, frame.angle_rad)
@@ -519,11 +646,19 @@ def farmstead(x: float, y: float, angle: float, rng: np.random.Generator, plan: 
     depth = float(rng.uniform(11, 17))
     length = float(rng.uniform(32, 66))
     colour = _pick(rng, _SHED)
-    yard = Area(rectangle(x, y, length + 16, count * (depth + 8) + 10, angle), "gravel", angle, float(rng.normal()))
+    yard = Area(
+        rectangle(x, y, length + 16, count * (depth + 8) + 10, angle), "gravel", angle, float(rng.normal())
+    )
     for i in range(count):
         shift = rng.normal(0, 3.0)
         cx, cy = frame.world(np.array([[shift, (i - (count - 1) / 2) * (depth + 7.0)]]))[0]
-        barn = rectangle(float(cx), float(cy), length * float(rng.uniform(0.75, 1.05)), depth * float(rng.uniform(0.9, 1.05)), angle + float(rng.normal(0, 0.012)))
+        barn = rectangle(
+            float(cx),
+            float(cy),
+            length * float(rng.uniform(0.75, 1.05)),
+            depth * float(rng.uniform(0.9, 1.05)),
+            angle + float(rng.normal(0, 0.012)),
+        )
         building = Building(barn, OTHER, 1, 5.5, "metal", _jitter(rng, colour, 10.0))
         plan.proposals.append(Proposal(building, 2.0, (yard,) if i == 0 else ()))
     for _ in range(3):
@@ -583,7 +718,9 @@ def settle(
     proposals: Sequence[Proposal], blocked: BaseGeometry, domain: Polygon, rng: np.random.Generator
 ) -> list[Proposal]:
     """The proposals that stand inside ``domain``, off ``blocked`` ground and clear of all earlier ones."""
-    shapes = shapely.set_precision(np.array([p.building.polygon for p in proposals], dtype=object), MILLIMETRE)
+    shapes = shapely.set_precision(
+        np.array([p.building.polygon for p in proposals], dtype=object), MILLIMETRE
+    )
     shapely.prepare(blocked)
     good = ~shapely.intersects(blocked, shapes) & shapely.covers(domain, shapes)
     good &= np.array([s.geom_type == "Polygon" and s.area > 2.0 for s in shapes])
@@ -600,7 +737,11 @@ def settle(
     for i, proposal in enumerate(proposals):
         if good[i] and not any(good[j] for j in rivals.get(i, ())):
             b = proposal.building
-            layer = UNDER_CONSTRUCTION if b.layer == OTHER and b.polygon.area > 130 and rng.random() < 0.006 else b.layer
+            layer = (
+                UNDER_CONSTRUCTION
+                if b.layer == OTHER and b.polygon.area > 130 and rng.random() < 0.006
+                else b.layer
+            )
             kept.append(
                 Proposal(
                     Building(shapes[i], layer, b.floors, b.height_m, b.roof, b.colour, b.name),
@@ -615,7 +756,9 @@ def settle(
     return kept
 
 
-def attach(canopies: Sequence[Building], built: Sequence[Building], blocked: BaseGeometry, domain: Polygon) -> list[Building]:
+def attach(
+    canopies: Sequence[Building], built: Sequence[Building], blocked: BaseGeometry, domain: Polygon
+) -> list[Building]:
     """The canopies that overlap no building but the edge they hang on."""
     if not canopies:
         return []

@@ -11,6 +11,7 @@ variation, haze, the sensor's blur and its noise.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -33,6 +34,7 @@ U8 = NDArray[np.uint8]
 _SHIFT = 4
 _WINDOW_PX = 1024
 _PERIOD_PX = 1024
+_TILED_PX = 2112
 _CANOPY_PX = 1536
 
 # Texture classes of the ground and the strength of fine (0.3 m), middle (1.2 m) and coarse (6 m) noise on them.
@@ -64,7 +66,7 @@ _GROUND: dict[str, tuple[tuple[int, int, int], float, int, float, float]] = {
     "mulch": ((128, 120, 108), 0.10, _SOIL, 1.2, 0.19),
     "grass": ((112, 128, 76), 0.09, _MEADOW, 0.0, 0.0),
     "grass_dry": ((150, 138, 102), 0.07, _MEADOW, 0.0, 0.0),
-    "soil": ((146, 120, 94), 0.11, _SOIL, 1.5, 0.10),
+    "soil": ((142, 123, 99), 0.10, _SOIL, 1.5, 0.10),
     "orchard": ((122, 128, 84), 0.07, _MEADOW, 0.0, 0.0),
     "vinyl_ground": ((138, 128, 104), 0.08, _GRAVEL, 0.0, 0.0),
     "village": ((128, 126, 94), 0.05, _MEADOW, 0.0, 0.0),
@@ -98,7 +100,16 @@ _ROAD_COLOUR = {
     "lane": (160, 157, 149),
     "track": (150, 141, 116),
 }
-_CARS = ((222, 222, 220), (232, 232, 230), (52, 54, 58), (40, 41, 44), (128, 130, 134), (168, 170, 172), (58, 78, 122), (142, 44, 40))
+_CARS = (
+    (222, 222, 220),
+    (232, 232, 230),
+    (52, 54, 58),
+    (40, 41, 44),
+    (128, 130, 134),
+    (168, 170, 172),
+    (58, 78, 122),
+    (142, 44, 40),
+)
 
 
 @lru_cache(maxsize=24)
@@ -106,11 +117,26 @@ def _noise(seed: int, sigma_px: float) -> F32:
     """(P, P) float32 periodic noise, mean 0, standard deviation 1, blurred by ``sigma_px``."""
     white = np.random.default_rng([seed, 77]).standard_normal((_PERIOD_PX, _PERIOD_PX))
     if sigma_px <= 0:
-        return white.astype(np.float32)
+        return _tiled(white.astype(np.float32))
     f = np.fft.fftfreq(_PERIOD_PX)
     damp = np.exp(-2 * (math.pi * sigma_px) ** 2 * f**2)
     smooth = np.fft.ifft2(np.fft.fft2(white) * damp[:, None] * damp[None, :]).real
-    return np.asarray(smooth / smooth.std(), dtype=np.float32)
+    return _tiled((smooth / smooth.std()).astype(np.float32))
+
+
+def _tiled(periodic: F32) -> F32:
+    """A periodic picture repeated to _TILED_PX, so that a window anywhere is a slice of it."""
+    index = np.arange(_TILED_PX) % _PERIOD_PX
+    return np.ascontiguousarray(periodic[np.ix_(index, index)])
+
+
+@lru_cache(maxsize=2)
+def _sensor_noise(seed: int, sigma: float) -> F32:
+    """(T, T, 3) float32 periodic noise of the sensor: mostly grey, a little coloured."""
+    grey = np.random.default_rng([seed + 8, 77]).standard_normal((_PERIOD_PX, _PERIOD_PX, 1))
+    tint = _noise(seed + 9, 0.6)[:_PERIOD_PX, :_PERIOD_PX, None]
+    both = sigma * (0.8 * grey + 0.5 * tint * np.array([1.0, -0.3, -0.7]))
+    return _tiled(both.astype(np.float32))
 
 
 @lru_cache(maxsize=8)
@@ -136,7 +162,7 @@ def _canopy(seed: int, season: Season, gsd_m: float, azimuth_deg: float, elevati
         higher = (dome > old) & (d2 < 1)
         height[at] = np.where(higher, dome, old)
         owner[at] = np.where(higher, k + 1, owner[at])
-    rough = np.tile(_noise(seed + 5, max(0.35 / gsd_m, 0.6)), (2, 2))[:size, :size]
+    rough = np.tile(_noise(seed + 5, max(0.35 / gsd_m, 0.6))[:_PERIOD_PX, :_PERIOD_PX], (2, 2))[:size, :size]
     height += 0.22 * rough
     east = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) / (2 * gsd_m)
     north = (np.roll(height, 1, 0) - np.roll(height, -1, 0)) / (2 * gsd_m)
@@ -148,7 +174,11 @@ def _canopy(seed: int, season: Season, gsd_m: float, azimuth_deg: float, elevati
         dx, dy = round(sun[0] / math.cos(el) * step / gsd_m), round(-sun[1] / math.cos(el) * step / gsd_m)
         blocker = np.roll(height, (-dy, -dx), (0, 1)) - step * math.tan(el)
         shade = np.minimum(shade, 1 - 0.5 * np.clip((blocker - height) / 0.8, 0, 1))
-    light = np.clip(0.3 + 0.78 * np.clip(lit, 0, 1.2), 0.25, 1.3) * shade * np.clip(0.55 + 0.16 * height, 0.45, 1.12)
+    light = (
+        np.clip(0.3 + 0.78 * np.clip(lit, 0, 1.2), 0.25, 1.3)
+        * shade
+        * np.clip(0.55 + 0.16 * height, 0.45, 1.12)
+    )
     palette = np.array(_CANOPY[season], dtype=np.float32)
     kind = rng.choice(len(palette), count + 1, p=[0.38, 0.28, 0.16, 0.18])
     tint = palette[kind] * rng.normal(1.0, 0.09, (count + 1, 1)) * rng.normal(1.0, 0.03, (count + 1, 3))
@@ -210,7 +240,11 @@ class Painter:
 
         self._pixels = pixels
         left, bottom, right, top = town.bounds
-        probe = pixels(np.array([[(left + right) / 2, (bottom + top) / 2], [(left + right) / 2 + 100.0, (bottom + top) / 2]]))
+        probe = pixels(
+            np.array(
+                [[(left + right) / 2, (bottom + top) / 2], [(left + right) / 2 + 100.0, (bottom + top) / 2]]
+            )
+        )
         self._turn = math.atan2(-(probe[1, 1] - probe[0, 1]), probe[1, 0] - probe[0, 0])
         self._buildings = self._shapes([b.polygon for b in town.buildings])
         self._order = sorted(range(len(town.buildings)), key=lambda i: (town.buildings[i].height_m, i))
@@ -226,7 +260,12 @@ class Painter:
         roads = sorted(town.roads, key=lambda r: ranks.index(r.kind))
         self._road_kinds = [r.kind for r in roads]
         self._roads = self._shapes([r.line.buffer(r.width_m / 2, cap_style="flat") for r in roads])
-        self._kerbs = self._shapes([r.line.buffer(r.width_m / 2 + (2.4 if r.kind == "arterial" else 0.9), cap_style="flat") for r in roads])
+        self._kerbs = self._shapes(
+            [
+                r.line.buffer(r.width_m / 2 + (2.4 if r.kind == "arterial" else 0.9), cap_style="flat")
+                for r in roads
+            ]
+        )
         self._marks: list[tuple[NDArray[np.float64], tuple[int, int, int], bool]] = []
         for r in roads:
             if r.kind in ("arterial", "main"):
@@ -238,10 +277,22 @@ class Painter:
                 for off in (half / 2, -half / 2) if r.kind == "arterial" else ():
                     self._mark(r.line, off, (214, 214, 210), True)
         self._mark_boxes = np.array([[*m[0].min(0), *m[0].max(0)] for m in self._marks]).reshape(-1, 4)
-        self._trees = np.column_stack([pixels(town.trees[:, :2]), town.trees[:, 2]]) if len(town.trees) else np.zeros((0, 3))
-        self._cars = np.column_stack([pixels(town.cars[:, :2]), town.cars[:, 2] + self._turn]) if len(town.cars) else np.zeros((0, 3))
+        self._trees = (
+            np.column_stack([pixels(town.trees[:, :2]), town.trees[:, 2]])
+            if len(town.trees)
+            else np.zeros((0, 3))
+        )
+        self._cars = (
+            np.column_stack([pixels(town.cars[:, :2]), town.cars[:, 2] + self._turn])
+            if len(town.cars)
+            else np.zeros((0, 3))
+        )
         rng = np.random.default_rng([self._seed, 80])
-        self._broad = [Waves(rng, (70.0, 420.0), 16), Waves(rng, (50.0, 260.0), 16), Waves(rng, (8.0, 40.0), 30)]
+        self._broad = [
+            Waves(rng, (70.0, 420.0), 16),
+            Waves(rng, (50.0, 260.0), 16),
+            Waves(rng, (8.0, 40.0), 30),
+        ]
         az, el = math.radians(self._style.sun_azimuth_deg), math.radians(self._style.sun_elevation_deg)
         az -= self._turn
         self._sun = np.array([math.sin(az) * math.cos(el), math.cos(az) * math.cos(el), math.sin(el)])
@@ -265,7 +316,9 @@ class Painter:
             boxes.append([*every.min(0), *every.max(0)])
         return _Shapes(rings, np.array(boxes).reshape(-1, 4))
 
-    def _mark(self, line: shapely.LineString, offset_m: float, colour: tuple[int, int, int], dashed: bool) -> None:
+    def _mark(
+        self, line: shapely.LineString, offset_m: float, colour: tuple[int, int, int], dashed: bool
+    ) -> None:
         moved = shapely.offset_curve(line, offset_m) if offset_m else line
         for part in shapely.get_parts(moved):
             if dashed:
@@ -292,15 +345,22 @@ class Painter:
         self._draw_walls(img, shadow)
         self._draw_cars(img, shadow)
         self._draw_tops(img, shadow)
-        soft = cv2.GaussianBlur(shadow, (0, 0), max(0.12 / self._gsd, 0.4)).astype(np.float32)[..., None] / 255.0
-        img *= 1.0 - soft * np.array([0.64, 0.60, 0.51], np.float32)
+        soft = (
+            cv2.GaussianBlur(shadow, (0, 0), max(0.12 / self._gsd, 0.4)).astype(np.float32)[..., None] / 255.0
+        )
+        broad = 1.0 + 0.035 * self._low(self._broad[0], shape, 64)
+        img *= broad[..., None] - (soft * broad[..., None]) * np.array([0.64, 0.60, 0.51], np.float32)
         return self._develop(img)[pad : pad + height, pad : pad + width]
 
-    def _points(self, ring: NDArray[np.float64], origin: NDArray[np.float64] | None = None) -> NDArray[np.int32]:
+    def _points(
+        self, ring: NDArray[np.float64], origin: NDArray[np.float64] | None = None
+    ) -> NDArray[np.int32]:
         at = self._origin if origin is None else origin
         return np.asarray(np.round((ring - at - 0.5) * (1 << _SHIFT)), dtype=np.int32)
 
-    def _fill(self, target: NDArray[np.uint8], rings: list[NDArray[np.float64]], colour: object, smooth: bool = True) -> None:
+    def _fill(
+        self, target: NDArray[np.uint8], rings: list[NDArray[np.float64]], colour: object, smooth: bool = True
+    ) -> None:
         kind = cv2.LINE_AA if smooth else cv2.LINE_8
         cv2.fillPoly(target, [self._points(r) for r in rings], colour, kind, _SHIFT)
 
@@ -313,7 +373,13 @@ class Painter:
         dx, dy = self._origin[0] - x0, self._origin[1] - y0
         moved = np.array([[1 / step, 0, dx / step], [0, 1 / step, dy / step]], np.float32)
         return np.asarray(
-            cv2.warpAffine(grid, moved, (shape[1], shape[0]), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE),
+            cv2.warpAffine(
+                grid,
+                moved,
+                (shape[1], shape[0]),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            ),
             dtype=np.float32,
         )
 
@@ -324,10 +390,22 @@ class Painter:
         label = np.zeros(shape, np.uint8)
         lines = np.ones(shape, np.float32)
         for i in self._banks.near(*frame):
-            self._fill(base, self._banks.rings[i], tuple(int(c * 0.97) for c in _MEADOW_COLOUR[self._style.season]))
+            self._fill(
+                base, self._banks.rings[i], tuple(int(c * 0.97) for c in _MEADOW_COLOUR[self._style.season])
+            )
         for i in self._fields.near(*frame):
             f = town.fields[i]
-            self._area(base, label, lines, self._fields.rings[i], self._fields.boxes[i], f.kind, f.angle_rad, f.shade, i)
+            self._area(
+                base,
+                label,
+                lines,
+                self._fields.rings[i],
+                self._fields.boxes[i],
+                f.kind,
+                f.angle_rad,
+                f.shade,
+                i,
+            )
         for i in self._sand.near(*frame):
             ragged = self._low(self._broad[2], shape)
             sand = np.zeros(shape, np.uint8)
@@ -347,7 +425,17 @@ class Painter:
             lines *= 1.0 + inside * (0.32 - 0.42 * depth + 0.05 * self._low(self._broad[2], shape))
         for i in self._grounds.near(*frame):
             g = town.grounds[i]
-            self._area(base, label, lines, self._grounds.rings[i], self._grounds.boxes[i], g.kind, g.angle_rad + self._turn, g.shade, i)
+            self._area(
+                base,
+                label,
+                lines,
+                self._grounds.rings[i],
+                self._grounds.boxes[i],
+                g.kind,
+                g.angle_rad + self._turn,
+                g.shade,
+                i,
+            )
             if g.kind == "parking":
                 self._stalls(base, self._grounds.rings[i], g.angle_rad + self._turn)
             elif g.kind == "sports":
@@ -368,19 +456,27 @@ class Painter:
                 self._fill_ones(lines, self._roads.rings[i])
         strength = min(1.0, 0.2 / gsd)
         b = self._mark_boxes
-        hit = (b[:, 0] <= frame[2]) & (b[:, 2] >= frame[0]) & (b[:, 1] <= frame[3]) & (b[:, 3] >= frame[1]) if len(b) else []
+        hit = (
+            (b[:, 0] <= frame[2]) & (b[:, 2] >= frame[0]) & (b[:, 1] <= frame[3]) & (b[:, 3] >= frame[1])
+            if len(b)
+            else []
+        )
         for i in np.flatnonzero(hit):
             points, paint, _ = self._marks[int(i)]
             mixed = tuple(int(strength * p + (1 - strength) * 106) for p in paint)
             cv2.polylines(base, [self._points(points)], False, mixed, 1, cv2.LINE_AA, _SHIFT)
 
-        grain = _GRAIN[label]
-        texture = grain[..., 0] * _noise(self._seed, round(0.3 / gsd, 2) if gsd < 0.6 else 0.5)[self._wrap]
-        texture += grain[..., 1] * _noise(self._seed + 1, round(1.2 / gsd, 2))[self._wrap]
-        texture += grain[..., 2] * _noise(self._seed + 2, round(6.0 / gsd, 2))[self._wrap]
-        img = base.astype(np.float32) * ((1.0 + texture) * lines)[..., None]
+        part = self._texture
+        texture = np.take(_GRAIN[:, 0], label) * part(
+            _noise(self._seed, round(0.3 / gsd, 2) if gsd < 0.6 else 0.5)
+        )
+        texture += np.take(_GRAIN[:, 1], label) * part(_noise(self._seed + 1, round(1.2 / gsd, 2)))
+        texture += np.take(_GRAIN[:, 2], label) * part(_noise(self._seed + 2, round(6.0 / gsd, 2)))
+        img = base.astype(np.float32)
+        img *= ((1.0 + texture) * lines)[..., None]
         # Worn and wet patches: green and brown do not vary together.
-        patch = (self._low(self._broad[1], shape) * 0.022 + 0.03 * _noise(self._seed + 3, round(9.0 / gsd, 2))[self._wrap])
+        patch = self._low(self._broad[1], shape) * 0.022
+        patch += 0.03 * part(_noise(self._seed + 3, round(9.0 / gsd, 2)))
         vegetated = (label == _MEADOW) | (label == _CROP)
         img[..., 0] *= 1.0 + np.where(vegetated, 1.1 * patch, 0.3 * patch)
         img[..., 2] *= 1.0 - np.where(vegetated, 0.7 * patch, 0.0)
@@ -391,7 +487,9 @@ class Painter:
             at = np.ix_(rows % _CANOPY_PX, cols % _CANOPY_PX)
             alpha = cv2.GaussianBlur(woods.astype(np.float32), (0, 0), 0.35 / gsd)[..., None]
             mix = self._low(self._broad[0], shape)[..., None]
-            crowns = canopy[at].astype(np.float32) * (1.0 + 0.15 * np.concatenate([mix, 0.7 * mix, 0.5 * mix], -1))
+            crowns = canopy[at].astype(np.float32) * (
+                1.0 + 0.15 * np.concatenate([mix, 0.7 * mix, 0.5 * mix], -1)
+            )
             img += alpha * (crowns - img)
         return img
 
@@ -412,9 +510,12 @@ class Painter:
         """One parcel or yard: its colour, its texture class and its rows."""
         colour, spread, texture, spacing, strength = _GROUND[kind]
         rng = np.random.default_rng([self._seed, 81, index])
-        hue = 0.012 if texture in (_PAVED, _SMOOTH, _GRAVEL) else 0.03
+        hue = 0.012 if texture in (_PAVED, _SMOOTH, _GRAVEL) else 0.018
         tint = np.array(colour) * (1 + spread * float(np.clip(shade, -2, 2)) * 0.8) * rng.normal(1.0, hue, 3)
-        if kind in ("village", "lawn", "grass", "complex", "orchard", "garden") and self._style.season in ("winter", "autumn"):
+        if kind in ("village", "lawn", "grass", "complex", "orchard", "garden") and self._style.season in (
+            "winter",
+            "autumn",
+        ):
             tint = 0.5 * tint + 0.5 * np.array(_MEADOW_COLOUR[self._style.season])
         self._fill(base, rings, tuple(int(np.clip(c, 0, 255)) for c in tint))
         self._fill(label, rings, texture, False)
@@ -427,7 +528,12 @@ class Painter:
         # Rows run along ``angle``; the lattice's y points down.
         across = x * math.sin(angle) + y * math.cos(angle)
         noise = _noise(self._seed + 4, round(4.0 / self._gsd, 2))
-        wobble = noise[np.ix_((np.arange(r0, r1) + int(self._origin[1])) % _PERIOD_PX, (np.arange(c0, c1) + int(self._origin[0])) % _PERIOD_PX)]
+        wobble = noise[
+            np.ix_(
+                (np.arange(r0, r1) + int(self._origin[1])) % _PERIOD_PX,
+                (np.arange(c0, c1) + int(self._origin[0])) % _PERIOD_PX,
+            )
+        ]
         phase = (across + 0.05 * spacing * wobble) * (2 * math.pi / spacing)
         wave = np.cos(phase)
         if kind in ("mulch", "pepper", "cabbage"):  # plastic film or plants on ridges: sharp stripes
@@ -442,7 +548,10 @@ class Painter:
     def _stalls(self, base: U8, rings: list[NDArray[np.float64]], angle: float) -> None:
         ring = rings[0]
         middle = ring[:-1].mean(axis=0)
-        along, across = np.array([math.cos(angle), -math.sin(angle)]), np.array([-math.sin(angle), -math.cos(angle)])
+        along, across = (
+            np.array([math.cos(angle), -math.sin(angle)]),
+            np.array([-math.sin(angle), -math.cos(angle)]),
+        )
         uv = np.column_stack([(ring - middle) @ along, (ring - middle) @ across])
         low, high = uv.min(0), uv.max(0)
         step = 2.5 / self._gsd
@@ -475,10 +584,14 @@ class Painter:
         left, top, right, bottom = self._frame
         if not len(b):
             return
-        for i in np.flatnonzero((b[:, 0] <= right) & (b[:, 2] >= left) & (b[:, 1] <= bottom) & (b[:, 3] >= top)):
+        for i in np.flatnonzero(
+            (b[:, 0] <= right) & (b[:, 2] >= left) & (b[:, 1] <= bottom) & (b[:, 3] >= top)
+        ):
             wall = self._walls[int(i)]
             for part in (0.5, 1.0):
-                cv2.polylines(shadow, [self._points(wall + self._cast * 1.3 * part)], False, 150, 1, cv2.LINE_AA, _SHIFT)
+                cv2.polylines(
+                    shadow, [self._points(wall + self._cast * 1.3 * part)], False, 150, 1, cv2.LINE_AA, _SHIFT
+                )
             cv2.polylines(img, [self._points(wall)], False, (176.0, 172.0, 164.0), 1, cv2.LINE_8, _SHIFT)
             cv2.polylines(shadow, [self._points(wall)], False, 0, 1, cv2.LINE_8, _SHIFT)
 
@@ -490,12 +603,24 @@ class Painter:
             x, y, angle = c[int(i)]
             rng = np.random.default_rng([self._seed, 82, int(i)])
             long, wide = (7.5, 2.3) if rng.random() < 0.06 else (float(rng.uniform(4.1, 4.9)), 1.85)
-            colour = np.array(_CARS[int(rng.choice(len(_CARS), p=[0.24, 0.14, 0.16, 0.14, 0.12, 0.1, 0.06, 0.04]))], dtype=np.float64)
+            colour = np.array(
+                _CARS[int(rng.choice(len(_CARS), p=[0.24, 0.14, 0.16, 0.14, 0.12, 0.1, 0.06, 0.04]))],
+                dtype=np.float64,
+            )
             u = np.array([math.cos(angle), -math.sin(angle)]) / self._gsd
             v = np.array([u[1], -u[0]])
 
-            def box(a0: float, a1: float, b: float, u: NDArray[np.float64] = u, v: NDArray[np.float64] = v, at: NDArray[np.float64] = np.array([x, y])) -> NDArray[np.float64]:  # noqa: B008
-                return np.array([at + a0 * u - b * v, at + a1 * u - b * v, at + a1 * u + b * v, at + a0 * u + b * v])
+            def box(
+                a0: float,
+                a1: float,
+                b: float,
+                u: NDArray[np.float64] = u,
+                v: NDArray[np.float64] = v,
+                at: NDArray[np.float64] = np.array([x, y]),
+            ) -> NDArray[np.float64]:
+                return np.array(
+                    [at + a0 * u - b * v, at + a1 * u - b * v, at + a1 * u + b * v, at + a0 * u + b * v]
+                )
 
             body = box(-long / 2, long / 2, wide / 2)
             self._sweep(shadow, body, self._cast * 1.3)
@@ -503,13 +628,19 @@ class Painter:
             cv2.fillConvexPoly(img, self._points(body), colour.tolist(), cv2.LINE_8, _SHIFT)
             if self._gsd < 0.45:
                 glass = (colour * 0.2 + 22).tolist()
-                cv2.fillConvexPoly(img, self._points(box(0.12 * long, 0.27 * long, wide * 0.42)), glass, cv2.LINE_8, _SHIFT)
-                cv2.fillConvexPoly(img, self._points(box(-0.38 * long, -0.28 * long, wide * 0.42)), glass, cv2.LINE_8, _SHIFT)
+                cv2.fillConvexPoly(
+                    img, self._points(box(0.12 * long, 0.27 * long, wide * 0.42)), glass, cv2.LINE_8, _SHIFT
+                )
+                cv2.fillConvexPoly(
+                    img, self._points(box(-0.38 * long, -0.28 * long, wide * 0.42)), glass, cv2.LINE_8, _SHIFT
+                )
 
     def _sweep(self, shadow: U8, ring: NDArray[np.float64], by: NDArray[np.float64]) -> None:
         """The ground that a ring covers while it moves by a vector: the shadow of an upright prism."""
         for a, b in zip(ring, np.roll(ring, -1, axis=0)):
-            cv2.fillConvexPoly(shadow, self._points(np.array([a, b, b + by, a + by])), 255, cv2.LINE_AA, _SHIFT)
+            cv2.fillConvexPoly(
+                shadow, self._points(np.array([a, b, b + by, a + by])), 255, cv2.LINE_AA, _SHIFT
+            )
 
     def _draw_tops(self, img: F32, shadow: U8) -> None:
         """Buildings and trees, lowest first: each throws its shadow, then covers what lies under it."""
@@ -521,7 +652,12 @@ class Painter:
         ]
         t = self._trees
         around = 30.0 / self._gsd
-        hit = (t[:, 0] > left - around) & (t[:, 0] < right + around) & (t[:, 1] > top - around) & (t[:, 1] < bottom + around)
+        hit = (
+            (t[:, 0] > left - around)
+            & (t[:, 0] < right + around)
+            & (t[:, 1] > top - around)
+            & (t[:, 1] < bottom + around)
+        )
         todo += [(1.1 + 1.7 * float(t[i, 2]), 1, int(i)) for i in np.flatnonzero(hit)]
         todo.sort()
         for height, is_tree, i in todo:
@@ -542,7 +678,10 @@ class Painter:
         n = max(1, round(r))
         kind = i % 7
         colour, alpha = _crown(self._seed, self._style.season, n, kind, self._style.sun_azimuth_deg)
-        r0, c0 = int(math.floor(y)) - n - 1 - int(self._origin[1]), int(math.floor(x)) - n - 1 - int(self._origin[0])
+        r0, c0 = (
+            math.floor(y) - n - 1 - int(self._origin[1]),
+            math.floor(x) - n - 1 - int(self._origin[0]),
+        )
         size = colour.shape[0]
         a, b = max(0, -r0), max(0, -c0)
         c, d = min(size, img.shape[0] - r0), min(size, img.shape[1] - c0)
@@ -575,12 +714,12 @@ class Painter:
         roi = self._roi(self._buildings.boxes[i], 3)
         if roi is None:
             return
-        r0, r1, c0, c1 = roi
+        _r0, _r1, _c0, _c1 = roi
         # Paint the roof on its own ground with a rim, so that it does not depend on where a window cuts it.
         left, top, right, bottom = self._buildings.boxes[i]
         rim = max(4, int(1.6 / self._gsd))
-        fc, fr = int(math.floor(left)) - rim, int(math.floor(top)) - rim
-        w, h = int(math.ceil(right)) + rim - fc, int(math.ceil(bottom)) + rim - fr
+        fc, fr = math.floor(left) - rim, math.floor(top) - rim
+        w, h = math.ceil(right) + rim - fc, math.ceil(bottom) + rim - fr
         at = np.array([fc, fr], dtype=np.float64)
         mask = np.zeros((h, w), np.uint8)
         cv2.fillPoly(mask, [self._points(r, at) for r in rings], 255, cv2.LINE_AA, _SHIFT)
@@ -596,7 +735,9 @@ class Painter:
             alpha = alpha * 0.93
         img[here] += alpha * (roof[a0:a1, b0:b1] - img[here])
 
-    def _roof(self, b: Building, index: int, rings: list[NDArray[np.float64]], at: NDArray[np.float64], mask: U8) -> F32:
+    def _roof(
+        self, b: Building, index: int, rings: list[NDArray[np.float64]], at: NDArray[np.float64], mask: U8
+    ) -> F32:
         """(h, w, 3) float32 lit roof over the pixels from global corner ``at``."""
         gsd = self._gsd
         rng = np.random.default_rng([self._seed, 83, index])
@@ -617,7 +758,10 @@ class Painter:
         facing = (float(across[0]), float(-across[1]))  # east, north of growing v
         rows, cols = (np.arange(h) + int(at[1])) % _PERIOD_PX, (np.arange(w) + int(at[0])) % _PERIOD_PX
         wrap = np.ix_(rows, cols)
-        fine, stain = _noise(self._seed + 6, round(0.25 / gsd, 2))[wrap], _noise(self._seed + 7, round(1.6 / gsd, 2))[wrap]
+        fine, stain = (
+            _noise(self._seed + 6, round(0.25 / gsd, 2))[wrap],
+            _noise(self._seed + 7, round(1.6 / gsd, 2))[wrap],
+        )
         light = 1.0 + 0.022 * fine
         colour = np.array(b.colour, dtype=np.float32)
         tone = np.ones((h, w, 3), np.float32)
@@ -643,7 +787,7 @@ class Painter:
         elif b.roof in ("shed", "box"):
             tilt = float(rng.choice([-1.0, 1.0]))
             light = light * self._lambert((tilt * facing[0], tilt * facing[1]), 0.12) * (1.0 + 0.045 * stain)
-            if 0.5 > 2.1 * gsd:
+            if 2.1 * gsd < 0.5:
                 light = light * (1.0 + 0.04 * np.cos(u * (2 * math.pi / 0.55)))
         elif b.roof == "vinyl":
             side = np.clip(2 * v / wide, -1, 1)
@@ -654,7 +798,11 @@ class Painter:
             light = light * (1.0 - 0.07 * (((u % 2.0) < 0.3) if gsd < 0.5 else 0.0))
             light = light * (1.0 + 0.09 * (np.abs(v) < 0.35))
         elif b.roof == "canopy":
-            light = light * (1.0 + 0.03 * stain) * self._lambert((facing[0] * rng.choice([-1, 1]), facing[1]), 0.08)
+            light = (
+                light
+                * (1.0 + 0.03 * stain)
+                * self._lambert((facing[0] * rng.choice([-1, 1]), facing[1]), 0.08)
+            )
             light = light * (1.0 - 0.06 * ((u % 1.8) < 0.25)) if gsd < 0.5 else light
         else:
             light, tone = self._flat(b, light, tone, fine, stain, mask, u, v, long, wide, rng)
@@ -666,7 +814,7 @@ class Painter:
         second = best.copy()
         light = np.ones(px.shape, np.float32)
         turn = np.sum(ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1])
-        for a, b in zip(ring[:-1], ring[1:]):
+        for a, b in itertools.pairwise(ring):
             edge = b - a
             length = float(np.hypot(*edge))
             if length < 0.3:
@@ -682,7 +830,9 @@ class Painter:
             best = np.where(closer, distance, best)
         ridge = (second - best < max(0.22, 0.7 * self._gsd)) & (best > 0.5)
         courses = 1.0 + 0.04 * np.cos(best * (2 * math.pi / 0.62)) if self._gsd < 0.29 else 1.0
-        return np.asarray(light * courses * (1.0 + 0.10 * ridge) * (1.0 - 0.12 * (best < 0.22)), dtype=np.float32)
+        return np.asarray(
+            light * courses * (1.0 + 0.10 * ridge) * (1.0 - 0.12 * (best < 0.22)), dtype=np.float32
+        )
 
     def _flat(
         self, b: Building, light: F32, tone: F32, fine: F32, stain: F32, mask: U8, u: F32, v: F32, long: float, wide: float,
@@ -697,7 +847,9 @@ class Painter:
         parapet = (deep < max(0.32, 0.9 * gsd)) & inside
         shade = np.zeros((h, w), np.float32)
         for length in (0.5, 1.0):
-            moved = cv2.warpAffine(mask, np.float32([[1, 0, self._cast[0] * length], [0, 1, self._cast[1] * length]]), (w, h))
+            moved = cv2.warpAffine(
+                mask, np.float32([[1, 0, self._cast[0] * length], [0, 1, self._cast[1] * length]]), (w, h)
+            )
             shade = np.maximum(shade, (moved < 128).astype(np.float32))
         light = np.where(parapet, light * 1.0, light * (1.0 - 0.42 * shade))
         tone = np.where(parapet[..., None], np.float32(0.45) + 0.55 * tone + 0.08, tone)
@@ -707,8 +859,19 @@ class Painter:
             cores = max(2, round(long / 19))
             for c in range(cores):
                 at = -long / 2 + (c + 0.5) * long / cores
-                things.append((at, float(rng.normal(0, 0.3)), float(rng.uniform(4.5, 6.0)), float(rng.uniform(3.6, 5.0)), 2.9, (186, 184, 178)))
-                things.append((at + long / cores / 2, float(rng.uniform(-3, 3)), 1.2, 1.2, 0.9, (150, 150, 150)))
+                things.append(
+                    (
+                        at,
+                        float(rng.normal(0, 0.3)),
+                        float(rng.uniform(4.5, 6.0)),
+                        float(rng.uniform(3.6, 5.0)),
+                        2.9,
+                        (186, 184, 178),
+                    )
+                )
+                things.append(
+                    (at + long / cores / 2, float(rng.uniform(-3, 3)), 1.2, 1.2, 0.9, (150, 150, 150))
+                )
         elif b.polygon.area > 45:
             su, sv = rng.choice([-1.0, 1.0], 2)
             bw, bd = float(rng.uniform(2.6, 4.2)), float(rng.uniform(2.2, 3.6))
@@ -732,7 +895,9 @@ class Painter:
             base = box.astype(np.float32)
             for part in np.linspace(0.2, 1.0, 5):
                 by = self._cast * tall * part
-                thrown = np.maximum(thrown, cv2.warpAffine(base, np.float32([[1, 0, by[0]], [0, 1, by[1]]]), (w, h)))
+                thrown = np.maximum(
+                    thrown, cv2.warpAffine(base, np.float32([[1, 0, by[0]], [0, 1, by[1]]]), (w, h))
+                )
             light = light * (1.0 - 0.5 * thrown * inside * ~box)
             light = np.where(box, 1.02 + 0.03 * fine, light)
             tone = np.where(box[..., None], np.array(colour, np.float32) / grey, tone)
@@ -741,22 +906,29 @@ class Painter:
     # --- the camera ----------------------------------------------------------------------------------------------
 
     def _develop(self, img: F32) -> U8:
-        st, shape = self._style, img.shape[:2]
-        broad = self._low(self._broad[0], (shape[0], shape[1]), 64)
-        img *= (1.0 + 0.035 * broad)[..., None]
-        gain = np.array([1 + 0.06 * st.warmth, 1.0, 1 - 0.08 * st.warmth], np.float32) * st.brightness
-        img = (img * gain - 118.0) * (st.contrast * 1.04) + 118.0
-        grey = img @ np.array([0.3, 0.59, 0.11], np.float32)
-        img += 0.2 * (grey[..., None] - img)  # haze and optics take some of every colour
-        img += st.haze * (np.array([196, 204, 214], np.float32) - img)
+        """Colour, contrast and haze as one matrix, then the sensor's blur and noise."""
+        st = self._style
+        gain = np.array([1 + 0.06 * st.warmth, 1.0, 1 - 0.08 * st.warmth]) * st.brightness
+        contrast = st.contrast * 1.04
+        # Optics and air take some of every colour.
+        fade = 0.8 * np.eye(3) + 0.2 * np.array([0.3, 0.59, 0.11])
+        linear = (1 - st.haze) * fade @ np.diag(gain * contrast)
+        shift = (1 - st.haze) * 118.0 * (1 - contrast) + st.haze * np.array([196.0, 204.0, 214.0])
+        img = cv2.transform(img, np.column_stack([linear, shift]).astype(np.float32))
         sigma = st.blur_m / self._gsd
         if sigma > 0.25:
             img = cv2.GaussianBlur(img, (0, 0), sigma)
-        noise = _noise(self._seed + 8, 0.0)[self._wrap]
-        tint = _noise(self._seed + 9, 0.6)[self._wrap]
-        img += (st.noise * 0.8 * noise)[..., None]
-        img += (st.noise * 0.5 * tint)[..., None] * np.array([1.0, -0.3, -0.7], np.float32)
-        return np.asarray(np.clip(np.rint(img), 0, 255), dtype=np.uint8)
+        img += self._texture(_sensor_noise(self._seed, st.noise))
+        np.maximum(img, 0, out=img)
+        return np.asarray(cv2.convertScaleAbs(img), dtype=np.uint8)
+
+    def _texture(self, periodic: F32) -> F32:
+        """The window's part of a periodic picture of _TILED_PX pixels: a view wherever the window is small enough."""
+        r, c = self._frame[1] % _PERIOD_PX, self._frame[0] % _PERIOD_PX
+        h, w = self._frame[3] - self._frame[1], self._frame[2] - self._frame[0]
+        if r + h <= _TILED_PX and c + w <= _TILED_PX:
+            return periodic[r : r + h, c : c + w]
+        return np.asarray(periodic[self._wrap])
 
 
 def render_imagery(town: Town, box: GeoBox, window_px: int = _WINDOW_PX) -> U8:
@@ -791,7 +963,9 @@ def write_kakao_tiles(town: Town, out_dir: Path, level: int = 1, ext: str = "jpg
     patches: dict[tuple[int, int], list[Tile]] = {}
     for tile in tiles:
         patches.setdefault((tile.y // group, tile.x // group), []).append(tile)
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if ext in ("jpg", "jpeg") else [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    options = (
+        [cv2.IMWRITE_JPEG_QUALITY, quality] if ext in ("jpg", "jpeg") else [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    )
     px = grid.tile_px
     for (_, _), members in sorted(patches.items()):
         spans = [grid.tile_bounds(t, level) for t in members]

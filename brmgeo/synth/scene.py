@@ -80,7 +80,9 @@ class TownStyle:
     def varied(seed: int) -> TownStyle:
         """A style drawn from ``seed``: other roofs, season, light, density and camera for each one."""
         rng = np.random.default_rng([seed, 0x57])
-        season: Season = ("spring", "summer", "autumn", "winter")[int(rng.choice(4, p=[0.25, 0.35, 0.25, 0.15]))]
+        season: Season = ("spring", "summer", "autumn", "winter")[
+            int(rng.choice(4, p=[0.25, 0.35, 0.25, 0.15]))
+        ]
         return TownStyle(
             density=float(rng.uniform(0.6, 1.25)),
             forest_share=float(rng.uniform(0.05, 0.45)),

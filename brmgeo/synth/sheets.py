@@ -41,7 +41,13 @@ FAULTS: tuple[tuple[str, int], ...] = (
     ("line_chain", 6),
     ("zero_area", 4),
 )
-_ROAD_LAYERS = {"arterial": "A0013112", "main": "A0013114", "street": "A0013115", "lane": "A0013116", "track": "A0013117"}
+_ROAD_LAYERS = {
+    "arterial": "A0013112",
+    "main": "A0013114",
+    "street": "A0013115",
+    "lane": "A0013116",
+    "track": "A0013117",
+}
 _SYMBOLS = ("PUBLIC", "SCHOOL", "TEMPLE", "WELL", "TOWER")
 
 
@@ -111,9 +117,11 @@ def _write_sheet(
     sheet = sheet_polygon(number, town.crs)
     clipped = clip_buildings(town, sheet)
     if not clipped:
-        raise SettingsError(f"sheet {number} holds no building of the generated town: choose sheets that meet {town.bounds}")
+        raise SettingsError(
+            f"sheet {number} holds no building of the generated town: choose sheets that meet {town.bounds}"
+        )
     rng = np.random.default_rng([town.seed, 0xD7, index])
-    doc = ezdxf.new(version, setup=False)
+    doc = ezdxf.new(version, setup=False, units=0 if version == "R12" else 6)
     if version == "R12":
         doc.encoding = "cp949"
         doc.header["$DWGCODEPAGE"] = "ANSI_949"
@@ -236,7 +244,9 @@ def _spoil(
     return True
 
 
-def _arc(a: NDArray[np.float64], b: NDArray[np.float64], bulge: float, count: int = 200) -> NDArray[np.float64]:
+def _arc(
+    a: NDArray[np.float64], b: NDArray[np.float64], bulge: float, count: int = 200
+) -> NDArray[np.float64]:
     """Points between ``a`` and ``b`` on DXF's arc of that bulge (tangent of a quarter of the angle, positive to the right)."""
     chord = b - a
     angle = 4 * math.atan(bulge)
@@ -262,7 +272,12 @@ class _Drawer:
         return name
 
     def ring(
-        self, points: NDArray[np.float64], layer: str, closed: bool, elevation: float = 0.0, bulge: float | None = None
+        self,
+        points: NDArray[np.float64],
+        layer: str,
+        closed: bool,
+        elevation: float = 0.0,
+        bulge: float | None = None,
     ) -> Any:
         """A polyline; ``bulge`` bends its first edge, a nonzero ``elevation`` lifts it."""
         rounded = np.round(points, 3).tolist()
@@ -289,7 +304,9 @@ class _Drawer:
         self._space.add_text(text, dxfattribs=attribs)
 
     def point(self, x: float, y: float, z: float, layer: str) -> None:
-        self._space.add_point((round(x, 3), round(y, 3), round(z, 2)), dxfattribs={"layer": self.layer(layer)})
+        self._space.add_point(
+            (round(x, 3), round(y, 3), round(z, 2)), dxfattribs={"layer": self.layer(layer)}
+        )
 
     def block(self, name: str, layer: str, draw: Callable[[Any, str], None]) -> None:
         draw(self.doc.blocks.new(name), self.layer(layer))
@@ -361,4 +378,6 @@ def _draw_rest(drawer: _Drawer, town: Town, sheet: Polygon, rng: np.random.Gener
             drawer.text(x + 1.5, y, f"{z:.1f}", "F0027217", 2.5)
     for x, y, radius in town.trees[:: max(1, len(town.trees) // 2500)].tolist():
         if sheet.contains(shapely.Point(x, y)):
-            drawer.line(np.array([x - radius, y]), np.array([x + radius, y]), f"C03{int(radius * 10) % 24:02d}000")
+            drawer.line(
+                np.array([x - radius, y]), np.array([x + radius, y]), f"C03{int(radius * 10) % 24:02d}000"
+            )

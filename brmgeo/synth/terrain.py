@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -25,7 +26,9 @@ class Waves:
         low, high = wavelengths_m
         wavelength = np.exp(rng.uniform(math.log(low), math.log(high), count))
         direction = rng.uniform(0, 2 * math.pi, count)
-        self._k = (2 * math.pi / wavelength)[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
+        self._k = (2 * math.pi / wavelength)[:, None] * np.column_stack(
+            [np.cos(direction), np.sin(direction)]
+        )
         self._phase = rng.uniform(0, 2 * math.pi, count)
         self._scale = math.sqrt(2.0 / count)
 
@@ -119,9 +122,7 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
     upper = n + shift + half
     water = _ribbon(middle, t, lower, upper)
     bank = _ribbon(middle, t, n - bank_half, n + bank_half)
-    levees = [
-        LineString(middle.world(np.column_stack([t, n + s * (bank_half + 3.0)]))) for s in (-1.0, 1.0)
-    ]
+    levees = [LineString(middle.world(np.column_stack([t, n + s * (bank_half + 3.0)]))) for s in (-1.0, 1.0)]
 
     smooth = offset + 0.6 * meander + side * (rng.uniform(245, 285) + 18 * np.sin(t / 410 + p2)) * scale
     arterial = LineString(middle.world(np.column_stack([t, smooth])))
@@ -154,16 +155,20 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
     level = float(np.quantile(hill, 1.0 - style.forest_share))
     keep_out = shapely.union_all([bank.buffer(12.0), arterial.buffer(20.0), cross.buffer(10.0)])
     woods: list[Polygon] = []
-    traced = contourpy.contour_generator(gx, gy, hill + 0.13 * rough, fill_type=contourpy.FillType.OuterOffset)
+    traced = contourpy.contour_generator(
+        gx, gy, hill + 0.13 * rough, fill_type=contourpy.FillType.OuterOffset
+    )
     points, offsets = traced.filled(level, float(hill.max()) + 10.0)
     for ring, cuts in zip(points, offsets):
-        parts = [ring[a:b] for a, b in zip(cuts[:-1], cuts[1:])]
+        parts = [ring[a:b] for a, b in itertools.pairwise(cuts)]
         shape = shapely.make_valid(Polygon(parts[0], [p for p in parts[1:] if Polygon(p).area > 400.0]))
         woods += polygons_of(shape.intersection(domain).difference(keep_out), 500.0)
 
     elevation = 62.0 + 14.0 * np.maximum(hill + 0.8, 0) + 60.0 * np.maximum(hill - level + 0.25, 0) ** 1.3
     lines: list[tuple[LineString, float]] = []
-    tracer = contourpy.contour_generator(gx, gy, elevation + 0.6 * rough, line_type=contourpy.LineType.Separate)
+    tracer = contourpy.contour_generator(
+        gx, gy, elevation + 0.6 * rough, line_type=contourpy.LineType.Separate
+    )
     for z in np.arange(45.0, float(elevation.max()), 5.0):
         for line in tracer.lines(z):
             if len(line) > 3:
@@ -224,9 +229,7 @@ def make_fields(
     spacing = 340.0
     count = max(4, int((right - left) * (top - bottom) / spacing**2))
     seeds = np.column_stack([rng.uniform(left, right, count), rng.uniform(bottom, top, count)])
-    cells = shapely.get_parts(
-        shapely.voronoi_polygons(shapely.multipoints(seeds), extend_to=ground.domain)
-    )
+    cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(seeds), extend_to=ground.domain))
     cells = [shapely.intersection(c, ground.domain) for c in cells]
     shapely.prepare(taken)
     crops, weights = CROPS[style.season]
@@ -266,9 +269,7 @@ def make_fields(
     return fields, tracks
 
 
-def _strips(
-    cell: Polygon, frame: Frame, rng: np.random.Generator, tracks: list[Road]
-) -> list[Polygon]:
+def _strips(cell: Polygon, frame: Frame, rng: np.random.Generator, tracks: list[Road]) -> list[Polygon]:
     reach = 0.75 * math.sqrt(cell.area) + 160.0
     pieces: list[Polygon] = []
     v = -reach
@@ -277,13 +278,20 @@ def _strips(
         line = LineString(frame.world(np.array([[-reach, v], [reach, v]])))
         inside = shapely.intersection(line, cell)
         tracks += [
-            Road(part, 3.2, "track") for part in shapely.get_parts(inside) if part.length > 40 and part.geom_type == "LineString"
+            Road(part, 3.2, "track")
+            for part in shapely.get_parts(inside)
+            if part.length > 40 and part.geom_type == "LineString"
         ]
         u = -reach
         while u < reach:
             wide = float(rng.choice([rng.uniform(14, 24), rng.uniform(24, 42)]))
             skew = rng.normal(0, 1.0, 2)
-            corners = [[u, v + 2.2], [u + wide, v + 2.2], [u + wide + skew[1], v + depth - 2.2], [u + skew[0], v + depth - 2.2]]
+            corners = [
+                [u, v + 2.2],
+                [u + wide, v + 2.2],
+                [u + wide + skew[1], v + depth - 2.2],
+                [u + skew[0], v + depth - 2.2],
+            ]
             pieces.append(Polygon(frame.world(np.array(corners))))
             u += wide + 1.0 + max(0.0, float(skew.max()))
         v += depth

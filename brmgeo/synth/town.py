@@ -24,13 +24,23 @@ from brmgeo.synth.scene import Area, Building, Road, Town, TownStyle
 from brmgeo.synth.terrain import MILLIMETRE, Frame, Ground, make_fields, make_ground, polygons_of
 
 MARGIN_M = 140.0
-_VILLAGES = ("양지마을회관", "새터마을회관", "안골경로당", "솔밭마을회관", "웃말회관", "강변마을회관", "범바위경로당", "느티나무회관",
-             "고갯마을회관", "탑골경로당", "물레방아회관", "대숲마을회관")  # fmt: skip
+_VILLAGES = (
+    "양지마을회관",
+    "새터마을회관",
+    "안골경로당",
+    "솔밭마을회관",
+    "웃말회관",
+    "강변마을회관",
+    "범바위경로당",
+    "느티나무회관",
+    "고갯마을회관",
+    "탑골경로당",
+    "물레방아회관",
+    "대숲마을회관",
+)
 
 
-def generate_town(
-    bounds: Bounds, seed: int, style: TownStyle | None = None, crs: str = "EPSG:5187"
-) -> Town:
+def generate_town(bounds: Bounds, seed: int, style: TownStyle | None = None, crs: str = "EPSG:5187") -> Town:
     """A town over ``bounds`` (left, bottom, right, top; metres in ``crs``), wholly determined by seed and style.
 
     Everything is laid out for MARGIN_M beyond the bounds, so that pictures and sheets may reach over them.
@@ -92,11 +102,11 @@ def generate_town(
         style=style,
         margin_m=MARGIN_M,
         buildings=tuple(buildings),
-        roads=tuple([*plan.roads, *tracks]),
+        roads=(*plan.roads, *tracks),
         water=tuple(ground.water),
         banks=tuple(polygons_of(ground.bank.intersection(ground.domain))),
         fields=tuple(fields),
-        grounds=tuple([*plan.grounds, *(g for p in kept for g in p.grounds)]),
+        grounds=(*plan.grounds, *(g for p in kept for g in p.grounds)),
         woods=tuple(ground.woods),
         trees=np.array(sorted(trees), dtype=np.float64).reshape(-1, 3),
         cars=_clear_cars(_road_cars(plan, rng), standing),
@@ -113,7 +123,10 @@ def _make_zones(
     """Apartment complexes, school and works: large plots at the town's edge, placed where they fit."""
     scale = min(1.0, ground.town_radius_m / 560.0)
     wanted: list[tuple[str, float, float]] = [("school", 118.0, 128.0)]
-    wanted += [("apartments", float(rng.uniform(170, 260)), float(rng.uniform(140, 210))) for _ in range(style.apartments)]
+    wanted += [
+        ("apartments", float(rng.uniform(170, 260)), float(rng.uniform(140, 210)))
+        for _ in range(style.apartments)
+    ]
     wanted += [("works", float(rng.uniform(150, 250)), float(rng.uniform(95, 150))) for _ in range(5)]
     roads = shapely.union_all([ground.arterial.buffer(13.0), ground.cross.buffer(10.0)])
     keep_out = shapely.union_all([roads, ground.bank.buffer(12.0), woods])
@@ -122,7 +135,9 @@ def _make_zones(
         if scale < 0.8 and kind != "school":
             w, h = w * 0.65, h * 0.65
         for _ in range(150):
-            away = ground.town_radius_m * float(rng.uniform(0.25, 1.15) if kind != "works" else rng.uniform(0.9, 1.9))
+            away = ground.town_radius_m * float(
+                rng.uniform(0.25, 1.15) if kind != "works" else rng.uniform(0.9, 1.9)
+            )
             at = float(rng.uniform(0, 2 * math.pi))
             x, y = ground.centre.world(np.array([[away * math.cos(at) * 1.2, away * math.sin(at)]]))[0]
             line = ground.arterial
@@ -151,7 +166,12 @@ def _make_zones(
 
 
 def _countryside(
-    ground: Ground, woods: BaseGeometry, built_up: BaseGeometry, rng: np.random.Generator, style: TownStyle, plan: Plan
+    ground: Ground,
+    woods: BaseGeometry,
+    built_up: BaseGeometry,
+    rng: np.random.Generator,
+    style: TownStyle,
+    plan: Plan,
 ) -> None:
     """Villages at the foot of the hills, farms, small works and petrol stations along the roads."""
     left, bottom, right, top = ground.domain.bounds
@@ -163,7 +183,9 @@ def _countryside(
         best: tuple[float, float, float] | None = None
         for _ in range(tries):
             x, y = float(rng.uniform(left + 60, right - 60)), float(rng.uniform(bottom + 60, top - 60))
-            if any(math.hypot(x - a, y - b) < keep_m for a, b in spots) or taken.intersects(Point(x, y).buffer(35)):
+            if any(math.hypot(x - a, y - b) < keep_m for a, b in spots) or taken.intersects(
+                Point(x, y).buffer(35)
+            ):
                 continue
             hill = float(ground.hillness(np.array([[x, y]]))[0]) - ground.forest_level
             score = -abs(hill + 0.55) + float(rng.normal(0, 0.2))
@@ -198,16 +220,22 @@ def _countryside(
                 if draw < 0.09:
                     districts.petrol_station(x, y, h, rng, plan)
                 elif draw < 0.55:
-                    plan.proposals += districts._house(rng, style, x, y, h + float(rng.normal(0, 0.1)), 15.0, False)
+                    plan.proposals += districts._house(
+                        rng, style, x, y, h + float(rng.normal(0, 0.1)), 15.0, False
+                    )
                 else:
                     districts._shop(rng, Point(x, y), h, plan)
             s += float(rng.exponential(85)) / max(style.density, 0.2) + 18
     # Huts scattered in the fields.
     for _ in range(round(11 * area_km2 * style.density)):
         x, y = float(rng.uniform(left, right)), float(rng.uniform(bottom, top))
-        hut = districts.rectangle(x, y, float(rng.uniform(2.6, 7)), float(rng.uniform(2.2, 4)), float(rng.uniform(0, 3.1)))
+        hut = districts.rectangle(
+            x, y, float(rng.uniform(2.6, 7)), float(rng.uniform(2.2, 4)), float(rng.uniform(0, 3.1))
+        )
         colour = districts._pick(rng, districts._SHED)
-        plan.proposals.append(districts.Proposal(Building(hut, districts.TEMPORARY, 1, 2.6, "box", colour), 1.0))
+        plan.proposals.append(
+            districts.Proposal(Building(hut, districts.TEMPORARY, 1, 2.6, "box", colour), 1.0)
+        )
 
 
 def _vinyl(fields: list[Area], rng: np.random.Generator, style: TownStyle, plan: Plan) -> list[Area]:
@@ -229,7 +257,8 @@ def _vinyl(fields: list[Area], rng: np.random.Generator, style: TownStyle, plan:
             elif k not in chosen:
                 done += 0.02 * target
     return [
-        Area(f.polygon, "vinyl_ground", f.angle_rad, f.shade) if i in chosen else f for i, f in enumerate(fields)
+        Area(f.polygon, "vinyl_ground", f.angle_rad, f.shade) if i in chosen else f
+        for i, f in enumerate(fields)
     ]
 
 
@@ -248,7 +277,9 @@ def _off_buildings(fields: list[Area], yards: BaseGeometry) -> list[Area]:
     out: list[Area] = []
     for f in fields:
         if shapely.intersects(yards, f.polygon):
-            out += [Area(p, f.kind, f.angle_rad, f.shade) for p in polygons_of(f.polygon.difference(yards), 80.0)]
+            out += [
+                Area(p, f.kind, f.angle_rad, f.shade) for p in polygons_of(f.polygon.difference(yards), 80.0)
+            ]
         else:
             out.append(f)
     return out
@@ -264,7 +295,9 @@ def _field_trees(
             c = f.polygon.centroid
             frame = Frame(c.x, c.y, f.angle_rad)
             step_u, step_v = rng.uniform(3.4, 5.0), rng.uniform(4.4, 6.0)
-            r = 0.5 * math.hypot(f.polygon.bounds[2] - f.polygon.bounds[0], f.polygon.bounds[3] - f.polygon.bounds[1])
+            r = 0.5 * math.hypot(
+                f.polygon.bounds[2] - f.polygon.bounds[0], f.polygon.bounds[3] - f.polygon.bounds[1]
+            )
             u, v = np.meshgrid(np.arange(-r, r, step_u), np.arange(-r, r, step_v))
             points = frame.world(np.column_stack([u.ravel(), v.ravel()]) + rng.normal(0, 0.25, (u.size, 2)))
             inside = shapely.contains_xy(f.polygon.buffer(-1.6), points[:, 0], points[:, 1])
@@ -280,12 +313,24 @@ def _field_trees(
         ring = wood.exterior
         for s in np.arange(0, ring.length, 5.0):
             p = ring.interpolate(float(s + rng.normal(0, 2)))
-            trees.append((p.x + float(rng.normal(0, 2.2)), p.y + float(rng.normal(0, 2.2)), float(rng.uniform(1.4, 3.6))))
+            trees.append(
+                (
+                    p.x + float(rng.normal(0, 2.2)),
+                    p.y + float(rng.normal(0, 2.2)),
+                    float(rng.uniform(1.4, 3.6)),
+                )
+            )
     for levee in ground.levees:
         for s in np.arange(0, levee.length, 9.0):
             if rng.random() < 0.28:
                 p = levee.interpolate(float(s))
-                trees.append((p.x + float(rng.normal(0, 5)), p.y + float(rng.normal(0, 5)), float(rng.uniform(1.0, 2.6))))
+                trees.append(
+                    (
+                        p.x + float(rng.normal(0, 5)),
+                        p.y + float(rng.normal(0, 5)),
+                        float(rng.uniform(1.0, 2.6)),
+                    )
+                )
     line = ground.arterial
     near = Point(ground.centre.x, ground.centre.y)
     for s in np.arange(0, line.length, 8.0):
@@ -295,7 +340,9 @@ def _field_trees(
             for side in (-1, 1):
                 if rng.random() < 0.7:
                     away = side * 9.2
-                    trees.append((p.x - away * math.sin(h), p.y + away * math.cos(h), float(rng.uniform(1.2, 2.2))))
+                    trees.append(
+                        (p.x - away * math.sin(h), p.y + away * math.cos(h), float(rng.uniform(1.2, 2.2)))
+                    )
     return trees
 
 
@@ -308,7 +355,9 @@ def _clear(
     xy = np.array(trees)
     shapely.prepare(standing)
     shapely.prepare(free)
-    good = ~shapely.intersects_xy(standing, xy[:, 0], xy[:, 1]) & shapely.contains_xy(free, xy[:, 0], xy[:, 1])
+    good = ~shapely.intersects_xy(standing, xy[:, 0], xy[:, 1]) & shapely.contains_xy(
+        free, xy[:, 0], xy[:, 1]
+    )
     return [t for t, g in zip(trees, good.tolist()) if g]
 
 
@@ -331,7 +380,9 @@ def _road_cars(plan: Plan, rng: np.random.Generator) -> list[tuple[float, float,
     return cars
 
 
-def _clear_cars(cars: list[tuple[float, float, float]], standing: BaseGeometry) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _clear_cars(
+    cars: list[tuple[float, float, float]], standing: BaseGeometry
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     xy = np.array(cars, dtype=np.float64).reshape(-1, 3)
     near = standing.buffer(1.2)
     shapely.prepare(near)
