@@ -101,8 +101,8 @@ def write_preview(
             color=INK,
         )
         _scale_bar(left, extent)
-        _north(left)
-        _legend(left, mask, _strength(imagery))
+        _north(left, panel_px, panel_h_px)
+        _legend(left, mask, _strength(imagery), panel_h_px)
         bar = figure.add_axes((RIGHT + panel_w + 0.008, boxes[1][1], 0.009, boxes[1][3]))
         colour_bar = figure.colorbar(picture, cax=bar, ticks=[0, 0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0])
         colour_bar.ax.set_yticklabels(
@@ -222,12 +222,12 @@ def _scale_bar(axes: Any, extent: tuple[float, float, float, float]) -> None:
     axes.text(x + length / 2, y + thick + 5 * unit, text, ha="center", va="bottom", fontsize=9)
 
 
-def _north(axes: Any) -> None:
-    box = axes.inset_axes((0.915, 0.90, 0.07, 0.085))
+def _north(axes: Any, panel_px: int, panel_h_px: int) -> None:
+    box = axes.inset_axes((1 - 62 / panel_px, 1 - 86 / panel_h_px, 50 / panel_px, 74 / panel_h_px))
     box.set_axis_off()
     box.set_xlim(-1, 1)
-    box.set_ylim(-1, 1.4)
-    box.add_patch(Rectangle((-1, -1), 2, 2.4, color=PAPER, alpha=0.82, lw=0))
+    box.set_ylim(-1, 1.6)
+    box.add_patch(Rectangle((-1, -1), 2, 2.6, color=PAPER, alpha=0.82, lw=0))
     box.add_patch(
         Polygon([(0, 0.75), (-0.45, -0.75), (0, -0.4)], closed=True, facecolor=INK, edgecolor=INK, lw=0.8)
     )
@@ -237,14 +237,14 @@ def _north(axes: Any) -> None:
     box.text(0, 0.8, "N", ha="center", va="bottom", fontsize=8.5, fontweight="bold")
 
 
-def _legend(axes: Any, mask: NDArray[np.uint8], strength: float) -> None:
+def _legend(axes: Any, mask: NDArray[np.uint8], strength: float, panel_h_px: int) -> None:
     entries = [Patch(facecolor=(*to_rgb(BUILDING), strength), edgecolor=BUILDING, label="Building")]
     if (mask == 255).any():
         entries.append(Patch(facecolor=UNKNOWN, edgecolor=UNKNOWN, label="Unknown: no sheet here"))
     axes.legend(
         handles=entries,
         loc="upper left",
-        bbox_to_anchor=(0.0, -0.035),
+        bbox_to_anchor=(0.0, -30 / panel_h_px),
         ncols=2,
         frameon=False,
         fontsize=9,

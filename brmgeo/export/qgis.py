@@ -91,32 +91,17 @@ def write_maps_project(
     """
     crs, bounds, _ = _raster_facts(buildings)
     vectors: list[_Layer] = []
-    for name, shown in (
-        ("footprints", "Building footprints"),
-        ("sheets", "Sheets"),
-        ("repairs", "Repaired outlines"),
-    ):
-        geometry, fields, layer_crs = _vector_facts(footprints, name)
-        if geometry is None:
-            if name == "footprints":
-                raise InputError(
-                    f"{footprints}: has no layer `footprints`; write it with export.footprints first"
-                )
-            continue
-        _same_crs(layer_crs, crs, footprints)
-        field = next(
-            (f for f in (KIND_FIELDS if name == "footprints" else SHEET_FIELDS) if f in fields), None
-        )
-        if name == "footprints":
-            looks = style.footprints_style(field, _distinct(footprints, name, field))
-        elif name == "sheets":
-            looks = style.sheets_style(field)
-        else:
-            looks = style.repairs_style(geometry)
+    styles = _vector_styles(footprints)
+    if "footprints" not in styles:
+        raise InputError(f"{footprints}: has no layer `footprints`; write it with export.footprints first")
+    shown = {"footprints": "Building footprints", "sheets": "Sheets", "repairs": "Repaired outlines"}
+    for name, (looks, geometry) in styles.items():
+        _same_crs(_vector_facts(footprints, name)[2], crs, footprints)
         source = f"./{footprints.name}|layername={name}"
         visible = name != "repairs"
+        open_legend = name == "footprints"
         vectors.append(
-            _Layer(name, shown, source, crs, looks, geometry, visible, attribution, name == "footprints")
+            _Layer(name, shown[name], source, crs, looks, geometry, visible, attribution, open_legend)
         )
 
     mask = _Layer("buildings", "Building mask", f"./{buildings.name}", crs, style.mask_style(), visible=False)
@@ -125,9 +110,7 @@ def write_maps_project(
     ratios = [
         _Layer(
             f"ratio_{i}",
-            f"Share of building within {radius:g} m"
-            if radius is not None
-            else f"Share of building, band {i}",
+            f"Within {radius:g} m" if radius is not None else f"Band {i}",
             f"./{ratio.name}",
             crs,
             style.ratio_style(i),
@@ -202,9 +185,10 @@ def write_flight_project(
     now += vector("smoothed_now", "smoothed", "Smoothed position", tracks["smoothed"][0])
     now += vector("reference_now", "reference", "Reference position", tracks["reference"][0])
     dots: list[_Layer] = []
+    lonlat = candidates.suffix == ".geojson"
+    facts = pyogrio.read_info(candidates, layer=None if lonlat else candidates.stem, force_feature_count=True)
     # A GeoJSON file without features has no geometry type, and QGIS drops such a layer.
-    if pyogrio.read_info(candidates, force_feature_count=True)["features"]:
-        lonlat = candidates.suffix == ".geojson"
+    if facts["features"]:
         source = f"./{candidates.name}" + ("" if lonlat else f"|layername={candidates.stem}")
         dots_crs = CRS.from_epsg(4326) if lonlat else crs
         dots_look = style.candidates_style()
@@ -234,6 +218,34 @@ def write_flight_project(
     )
     _write(path, title, crs, extent, tree, attribution, clock)
     return path
+
+
+def style_footprints(footprints: Path) -> None:
+    """Makes a region's styles the defaults of ``footprints.gpkg``, for people who open the file without the project.
+
+    Covers the layers footprints, sheets and repairs, as far as they are there; call it where the file is made.
+    Raises InputError when the file cannot be read.
+    """
+    style.add_default_styles(footprints, _vector_styles(footprints))
+
+
+def _vector_styles(footprints: Path) -> dict[str, tuple[Style, str]]:
+    """Style and geometry of the layers that a region's vector file has, in the order in which they are drawn."""
+    styles: dict[str, tuple[Style, str]] = {}
+    for name in ("footprints", "sheets", "repairs"):
+        geometry, fields, _ = _vector_facts(footprints, name)
+        if geometry is None:
+            continue
+        field = next(
+            (f for f in (KIND_FIELDS if name == "footprints" else SHEET_FIELDS) if f in fields), None
+        )
+        if name == "footprints":
+            styles[name] = (style.footprints_style(field, _distinct(footprints, name, field)), geometry)
+        elif name == "sheets":
+            styles[name] = (style.sheets_style(field), geometry)
+        else:
+            styles[name] = (style.repairs_style(geometry), geometry)
+    return styles
 
 
 def _raster_facts(path: Path) -> tuple[CRS, Bounds, list[float | None]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
 import pyogrio
 import shapely
 from numpy.typing import NDArray
@@ -69,22 +70,23 @@ def write_layer(
     ``geometry`` (n,) array of shapely geometries; ``columns`` name -> (n,) bool, int, float64 (NaN is NULL), str, or
     datetime64[ms], which is taken and marked as UTC.
     """
-    fields = list(columns)
-    data = [np.asarray(c) if c.dtype.kind != "U" else c.astype(object) for c in columns.values()]
-    utc = {f: np.full(len(c), 100, dtype=np.int8) for f, c in columns.items() if c.dtype.kind == "M"}
+    arrays = [pa.array(shapely.to_wkb(geometry), type=pa.binary())]
+    for values in columns.values():
+        # An empty column of objects tells no type, so texts are named as such.
+        kind = {"M": pa.timestamp("ms", tz="UTC"), "O": pa.string()}.get(values.dtype.kind)
+        arrays.append(pa.array(values, type=kind, from_pandas=values.dtype.kind == "f"))
     # 1.3 is what the QGIS of a stable distribution reads without a warning.
     options = {"VERSION": "1.3"} if not path.exists() else {}
     with _fixed_date():
-        pyogrio.raw.write(
+        # Arrow batches are written several times faster than columns of Python objects.
+        pyogrio.write_arrow(
+            pa.table(arrays, names=["geom", *columns]),
             path,
-            geometry=shapely.to_wkb(geometry),
-            field_data=data,
-            fields=np.asarray(fields, dtype=object),
             layer=layer,
             driver="GPKG",
+            geometry_name="geom",
             geometry_type=geometry_type,
             crs=crs,
-            gdal_tz_offsets=utc,
             dataset_options=options,
             layer_options={"GEOMETRY_NAME": "geom"},
         )

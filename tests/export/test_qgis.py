@@ -10,13 +10,14 @@ from pathlib import Path
 
 import geopandas as gpd
 import numpy as np
+import pyogrio
 import pytest
 from small_region import CRS, Region, flight, write_region
 
 from brmgeo.errors import CrsError, InputError
 from brmgeo.export import qgis_style
 from brmgeo.export.candidates import write_candidates
-from brmgeo.export.qgis import write_flight_project, write_maps_project
+from brmgeo.export.qgis import style_footprints, write_flight_project, write_maps_project
 from brmgeo.export.trajectory import Track, write_trajectory
 
 CHECK = Path(__file__).parents[1] / "qgis" / "check_qgis.py"
@@ -123,6 +124,23 @@ def test_every_kind_in_the_footprints_has_a_style_in_plain_words(region: Region,
     assert len(renderer.findall("symbols/symbol")) == len(labels)
 
 
+def test_the_vector_file_carries_the_styles_and_keeps_its_features(region: Region, tmp_path: Path) -> None:
+    copies = [tmp_path / "a.gpkg", tmp_path / "b.gpkg"]
+    for copy in copies:
+        shutil.copy(region.footprints, copy)
+        style_footprints(copy)
+    style_footprints(copies[1])
+    found = [pyogrio.read_dataframe(c, layer="layer_styles", read_geometry=False) for c in copies]
+    assert list(found[0]["f_table_name"]) == ["footprints", "sheets"]
+    assert found[0].equals(found[1]), "styling twice is styling once"
+    root = ET.fromstring(found[0]["styleQML"][0].split("\n", 1)[1])
+    assert root.find("renderer-v2").get("type") == "categorizedSymbol"
+    assert root.findtext("layerGeometryType") == "2"
+    assert pyogrio.read_dataframe(copies[0], layer="footprints").equals(
+        pyogrio.read_dataframe(region.footprints, layer="footprints")
+    )
+
+
 @pytest.mark.parametrize("digit", "012345678")
 def test_new_and_old_layer_codes_mean_the_same_kind(digit: str) -> None:
     assert qgis_style.kind_of(f"B001411{digit}") == qgis_style.kind_of(f"411{digit}")
@@ -131,8 +149,9 @@ def test_new_and_old_layer_codes_mean_the_same_kind(digit: str) -> None:
     assert qgis_style.kind_of("shed") is None
 
 
-def test_flight_project_plays_the_flight_over_the_maps(region: Region) -> None:
-    path = flight_project(region)
+@pytest.mark.parametrize("limit", [100_000, 10])
+def test_flight_project_plays_the_flight_over_the_maps(region: Region, limit: int) -> None:
+    path = flight_project(region, limit)
     root = opened(path)
     assert root.findtext("ProjectTimeSettings/TemporalRange/start") == "2026-05-01T03:00:00.000Z"
     assert root.findtext("ProjectTimeSettings/TemporalRange/end") == "2026-05-01T03:00:59.999Z"

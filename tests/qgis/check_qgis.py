@@ -297,7 +297,7 @@ def render(project, view, path, moment, findings):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="is searched for .qgz files")
+    parser.add_argument("folder", type=Path, help="a folder, searched for .qgz files, or one .qgz")
     parser.add_argument("--out", type=Path, help="where the pictures go (a temporary folder when not given)")
     arguments = parser.parse_args()
     projects = sorted(arguments.folder.rglob("*.qgz")) if arguments.folder.is_dir() else [arguments.folder]
@@ -313,7 +313,9 @@ def main():
     print(f"QGIS {Qgis.QGIS_VERSION}")
     findings = Findings()
     for path in projects:
-        name = "-".join(path.relative_to(arguments.folder).with_suffix("").parts) or path.stem
+        name = path.stem
+        if path != arguments.folder:
+            name = "-".join(path.relative_to(arguments.folder).with_suffix("").parts)
         check_project(path, name, out, findings)
     application.exitQgis()
     print("all well" if not findings.failures else f"{findings.failures} wrong")
