@@ -81,9 +81,16 @@ class ImagerySettings(_Settings):
     timeout_s: Positive = 20.0
     missing_share: Share = 0.0
     crs: str | None = None
+    bands: tuple[Annotated[int, Field(ge=1)], ...] | None = None
+    value_range: tuple[float, float] | None = None
     attribution: str = ""
     terms: str = ""
     compression: Literal["jpeg", "zstd"] = "jpeg"
+
+    @field_validator("bands", "value_range", mode="before")
+    @classmethod
+    def _tuple(cls, value: Any) -> Any:
+        return tuple(value) if isinstance(value, list) else value
 
     @model_validator(mode="after")
     def _complete(self) -> ImagerySettings:

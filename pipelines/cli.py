@@ -32,7 +32,7 @@ scheduler_option = click.option(
 )
 
 
-class _Numbers(click.ParamType):
+class _Numbers(click.ParamType[tuple[float, ...]]):
     """Comma-separated numbers."""
 
     name = "a,b,..."
@@ -119,7 +119,7 @@ def maps(
         spec = job.region_of_files(
             out, footprints, crs, imagery, sheets, bounds, gsd_m, radii_m, layer, encoding, repairs
         )
-        job.build_maps(spec, out / ".brmgeo", out, base=Path.cwd(), scheduler_spec=scheduler)
+        job.build_maps(spec, out / ".brmgeo", out, Path.cwd(), scheduler)
         return
     if region is None:
         raise SettingsError(

@@ -79,7 +79,9 @@ def test_a_room_knows_only_what_the_picture_allows(module: str) -> None:
         return
     room = room_of(module)
     if room is None:
-        assert module == "brmgeo", f"{module} belongs to no room: add it to docs/ARCHITECTURE.md and to this test"
+        assert module == "brmgeo", (
+            f"{module} belongs to no room: add it to docs/ARCHITECTURE.md and to this test"
+        )
         assert not own
         return
     for name in own:
@@ -94,7 +96,9 @@ def test_kernels_and_adapters_do_not_know_each_other(module: str) -> None:
     adapter = any(inside(module, name) for name in ADAPTERS) and module not in VALUES
     if kernel:
         assert not {n for n in own for a in ADAPTERS if inside(n, a) and n not in VALUES}
-        assert not {n for n in own if n.split(".")[0] in FORBIDDEN_IN_KERNELS}, "a kernel takes arrays and numbers"
+        assert not {n for n in own if n.split(".")[0] in FORBIDDEN_IN_KERNELS}, (
+            "a kernel takes arrays and numbers"
+        )
     if adapter:
         assert not {n for n in own for k in KERNELS if inside(n, k)}
 

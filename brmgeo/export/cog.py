@@ -39,6 +39,7 @@ import rasterio.windows
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from rasterio._err import CPLE_BaseError
+from rasterio.enums import Resampling
 from rasterio.errors import RasterioError, RasterioIOError
 
 from brmgeo.errors import InputError, MissingInputError, WorkflowError
@@ -260,6 +261,23 @@ def read_window(path: Path, window: Window | None = None, bands: Sequence[int] |
             except (RasterioError, CPLE_BaseError, IndexError) as error:
                 raise InputError(f"{path} is damaged or has not these bands: {_one_line(error)}") from error
         return out
+
+
+def read_overview(path: Path, most_px: int) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
+    """The whole raster at most ``most_px`` on its longer side, from its overviews: (bands, h, w), and its bounds.
+
+    Bounds are (left, bottom, right, top) in the raster's CRS. Masks are picked, pictures averaged, so that a mask keeps its
+    values. Raises MissingInputError or InputError where the raster cannot be read.
+    """
+    with _opened(path) as src:
+        shrink = max(1.0, max(src.height, src.width) / most_px)
+        shape = (src.count, max(1, round(src.height / shrink)), max(1, round(src.width / shrink)))
+        how = Resampling.average if src.count == 3 else Resampling.nearest
+        try:
+            pixels = src.read(out_shape=shape, resampling=how)
+        except RasterioError as error:
+            raise InputError(f"{path} is damaged: {_one_line(error)}") from error
+        return pixels, (src.bounds.left, src.bounds.bottom, src.bounds.right, src.bounds.top)
 
 
 @contextlib.contextmanager
