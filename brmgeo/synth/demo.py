@@ -14,7 +14,7 @@ from brmgeo.synth.town import generate_town
 
 DEMO_CRS = "EPSG:5187"
 DEMO_BOUNDS: Bounds = (194430.0, 444640.0, 196630.0, 447380.0)
-"""2.20 x 2.74 km about the edge at 128.95 E between the two sheets; the town is invented, the place only lends coordinates."""
+"""2.20 x 2.74 km about the edge at 128.95 E between the two sheets; the town is invented."""
 DEMO_SHEETS = ("36808058", "36808059")
 DEMO_SEED = 1
 

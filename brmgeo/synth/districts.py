@@ -215,7 +215,7 @@ def make_streets(
     outline = Polygon(
         ground.centre.world(np.column_stack([blob * np.cos(angle) * 1.12, blob * np.sin(angle) * 0.9]))
     )
-    outline = outline.difference(shapely.union_all([ground.bank.buffer(8.0), zones]))
+    inside = outline.difference(shapely.union_all([ground.bank.buffer(8.0), zones]))
     lines: list[LineString] = []
     s = np.arange(-1.3 * radius, 1.3 * radius, 8.0)
     for axis in (0, 1):
@@ -235,7 +235,7 @@ def make_streets(
     roads: list[Road] = []
     for line in lines:
         wide = float(rng.choice([4.2, 5.5, 7.5], p=[0.4, 0.4, 0.2])) * style.road_scale
-        for part in shapely.get_parts(shapely.intersection(line, outline)):
+        for part in shapely.get_parts(shapely.intersection(line, inside)):
             if part.geom_type == "LineString" and part.length > 45:
                 roads.append(Road(part, wide, "street"))
     return roads

@@ -456,13 +456,9 @@ class Painter:
                 self._fill_ones(lines, self._roads.rings[i])
         strength = min(1.0, 0.2 / gsd)
         b = self._mark_boxes
-        hit = (
-            (b[:, 0] <= frame[2]) & (b[:, 2] >= frame[0]) & (b[:, 1] <= frame[3]) & (b[:, 3] >= frame[1])
-            if len(b)
-            else []
-        )
-        for i in np.flatnonzero(hit):
-            points, paint, _ = self._marks[int(i)]
+        hit = (b[:, 0] <= frame[2]) & (b[:, 2] >= frame[0]) & (b[:, 1] <= frame[3]) & (b[:, 3] >= frame[1])
+        for k in np.flatnonzero(hit).tolist():
+            points, paint, _ = self._marks[k]
             mixed = tuple(int(strength * p + (1 - strength) * 106) for p in paint)
             cv2.polylines(base, [self._points(points)], False, mixed, 1, cv2.LINE_AA, _SHIFT)
 
@@ -603,6 +599,7 @@ class Painter:
             x, y, angle = c[int(i)]
             rng = np.random.default_rng([self._seed, 82, int(i)])
             long, wide = (7.5, 2.3) if rng.random() < 0.06 else (float(rng.uniform(4.1, 4.9)), 1.85)
+            middle = np.array([x, y])
             colour = np.array(
                 _CARS[int(rng.choice(len(_CARS), p=[0.24, 0.14, 0.16, 0.14, 0.12, 0.1, 0.06, 0.04]))],
                 dtype=np.float64,
@@ -616,7 +613,7 @@ class Painter:
                 b: float,
                 u: NDArray[np.float64] = u,
                 v: NDArray[np.float64] = v,
-                at: NDArray[np.float64] = np.array([x, y]),
+                at: NDArray[np.float64] = middle,
             ) -> NDArray[np.float64]:
                 return np.array(
                     [at + a0 * u - b * v, at + a1 * u - b * v, at + a1 * u + b * v, at + a0 * u + b * v]
@@ -848,7 +845,9 @@ class Painter:
         shade = np.zeros((h, w), np.float32)
         for length in (0.5, 1.0):
             moved = cv2.warpAffine(
-                mask, np.float32([[1, 0, self._cast[0] * length], [0, 1, self._cast[1] * length]]), (w, h)
+                mask,
+                np.array([[1, 0, self._cast[0] * length], [0, 1, self._cast[1] * length]], np.float32),
+                (w, h),
             )
             shade = np.maximum(shade, (moved < 128).astype(np.float32))
         light = np.where(parapet, light * 1.0, light * (1.0 - 0.42 * shade))
@@ -884,7 +883,8 @@ class Painter:
                 things.append((at_u - su * bw, at_v, 1.5, 1.5, 1.6, tank))
             for _ in range(int(min(14, b.polygon.area / 90))):
                 things.append((
-                    float(rng.uniform(-0.42, 0.42) * long), float(rng.uniform(-0.38, 0.38) * wide), float(rng.uniform(0.8, 2.4)),
+                    float(rng.uniform(-0.42, 0.42) * long), float(rng.uniform(-0.38, 0.38) * wide),
+                    float(rng.uniform(0.8, 2.4)),
                     float(rng.uniform(0.7, 1.6)), float(rng.uniform(0.6, 1.4)), (188, 188, 186),
                 ))  # fmt: skip
         for at_u, at_v, bw, bd, tall, colour in things:
@@ -896,7 +896,7 @@ class Painter:
             for part in np.linspace(0.2, 1.0, 5):
                 by = self._cast * tall * part
                 thrown = np.maximum(
-                    thrown, cv2.warpAffine(base, np.float32([[1, 0, by[0]], [0, 1, by[1]]]), (w, h))
+                    thrown, cv2.warpAffine(base, np.array([[1, 0, by[0]], [0, 1, by[1]]], np.float32), (w, h))
                 )
             light = light * (1.0 - 0.5 * thrown * inside * ~box)
             light = np.where(box, 1.02 + 0.03 * fine, light)

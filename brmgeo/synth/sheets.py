@@ -1,9 +1,10 @@
 """A generated town as NGII map sheets in DXF, with everything that makes real sheets awkward, counted in a manifest.
 
-Each sheet holds the town cut at its neatline: building outlines on B0014111 to B0014118, the neatline on H0017334, roads,
-walls, fields, contours and spot heights, Korean names, and facility symbols as INSERTs of blocks whose contents lie on building layers.
-A small share of the outlines carries one fault each: none of them changes what ground is built on, except where the manifest's
-``area_m2`` says so (an arc's bulge, the loops of a bow-tie read even-odd). The same town gives the same bytes.
+Each sheet holds the town cut at its neatline: building outlines on B0014111 to B0014118, the neatline on H0017334,
+roads, walls, fields, contours and spot heights, Korean names, and facility symbols as INSERTs of blocks whose contents
+lie on building layers. A small share of the outlines carries one fault each: none of them changes what ground is built
+on, except where ``area_m2`` of the manifest says so (an arc's bulge, the loops of a bow-tie read even-odd). The same
+town gives the same bytes.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import ezdxf
 import numpy as np
 import shapely
+from ezdxf._options import options
 from ezdxf.document import Drawing
+from ezdxf.filemanagement import new
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
@@ -82,16 +84,16 @@ def write_sheets(
     Raises SettingsError where a sheet holds no building.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
-    before = ezdxf.options.write_fixed_meta_data_for_testing
+    before = options.write_fixed_meta_data_for_testing
     # Time stamps and GUIDs are the only things in a DXF that would differ between two runs.
-    ezdxf.options.write_fixed_meta_data_for_testing = True
+    options.write_fixed_meta_data_for_testing = True
     try:
         sheets = {
             number: _write_sheet(town, out_dir, number, versions[i % len(versions)], faults, i)
             for i, number in enumerate(numbers)
         }
     finally:
-        ezdxf.options.write_fixed_meta_data_for_testing = before
+        options.write_fixed_meta_data_for_testing = before
     return {"crs": town.crs, "seed": town.seed, "bounds": list(town.bounds), "sheets": sheets}
 
 
@@ -121,7 +123,7 @@ def _write_sheet(
             f"sheet {number} holds no building of the generated town: choose sheets that meet {town.bounds}"
         )
     rng = np.random.default_rng([town.seed, 0xD7, index])
-    doc = ezdxf.new(version, setup=False, units=0 if version == "R12" else 6)
+    doc = new(version, setup=False, units=0 if version == "R12" else 6)
     if version == "R12":
         doc.encoding = "cp949"
         doc.header["$DWGCODEPAGE"] = "ANSI_949"
@@ -247,7 +249,7 @@ def _spoil(
 def _arc(
     a: NDArray[np.float64], b: NDArray[np.float64], bulge: float, count: int = 200
 ) -> NDArray[np.float64]:
-    """Points between ``a`` and ``b`` on DXF's arc of that bulge (tangent of a quarter of the angle, positive to the right)."""
+    """Points between ``a`` and ``b`` on the arc of a DXF bulge (tangent of a quarter of its angle)."""
     chord = b - a
     angle = 4 * math.atan(bulge)
     radius = math.hypot(*chord) / (2 * math.sin(angle / 2))

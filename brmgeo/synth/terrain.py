@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import contourpy
 import numpy as np
@@ -158,7 +159,8 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
     traced = contourpy.contour_generator(
         gx, gy, hill + 0.13 * rough, fill_type=contourpy.FillType.OuterOffset
     )
-    points, offsets = traced.filled(level, float(hill.max()) + 10.0)
+    filled: Any = traced.filled(level, float(hill.max()) + 10.0)
+    points, offsets = filled
     for ring, cuts in zip(points, offsets):
         parts = [ring[a:b] for a, b in itertools.pairwise(cuts)]
         shape = shapely.make_valid(Polygon(parts[0], [p for p in parts[1:] if Polygon(p).area > 400.0]))
@@ -170,7 +172,8 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
         gx, gy, elevation + 0.6 * rough, line_type=contourpy.LineType.Separate
     )
     for z in np.arange(45.0, float(elevation.max()), 5.0):
-        for line in tracer.lines(z):
+        rings: Any = tracer.lines(z)
+        for line in rings:
             if len(line) > 3:
                 clipped = shapely.intersection(LineString(line), domain)
                 lines += [(p, float(z)) for p in shapely.get_parts(clipped) if p.geom_type == "LineString"]
@@ -230,13 +233,12 @@ def make_fields(
     count = max(4, int((right - left) * (top - bottom) / spacing**2))
     seeds = np.column_stack([rng.uniform(left, right, count), rng.uniform(bottom, top, count)])
     cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(seeds), extend_to=ground.domain))
-    cells = [shapely.intersection(c, ground.domain) for c in cells]
     shapely.prepare(taken)
     crops, weights = CROPS[style.season]
     base = np.array(weights)
     fields: list[Area] = []
     tracks: list[Road] = []
-    for cell in cells:
+    for cell in shapely.intersection(cells, ground.domain):
         if cell.is_empty or shapely.covers(taken, cell):
             continue
         middle = np.array([[cell.centroid.x, cell.centroid.y]])

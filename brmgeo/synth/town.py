@@ -20,7 +20,7 @@ from brmgeo.errors import SettingsError
 from brmgeo.geo.grid import Bounds
 from brmgeo.synth import districts
 from brmgeo.synth.districts import Plan
-from brmgeo.synth.scene import Area, Building, Road, Town, TownStyle
+from brmgeo.synth.scene import TEMPORARY, Area, Building, Road, Town, TownStyle
 from brmgeo.synth.terrain import MILLIMETRE, Frame, Ground, make_fields, make_ground, polygons_of
 
 MARGIN_M = 140.0
@@ -233,9 +233,7 @@ def _countryside(
             x, y, float(rng.uniform(2.6, 7)), float(rng.uniform(2.2, 4)), float(rng.uniform(0, 3.1))
         )
         colour = districts._pick(rng, districts._SHED)
-        plan.proposals.append(
-            districts.Proposal(Building(hut, districts.TEMPORARY, 1, 2.6, "box", colour), 1.0)
-        )
+        plan.proposals.append(districts.Proposal(Building(hut, TEMPORARY, 1, 2.6, "box", colour), 1.0))
 
 
 def _vinyl(fields: list[Area], rng: np.random.Generator, style: TownStyle, plan: Plan) -> list[Area]:
