@@ -371,13 +371,11 @@ class Belief:
                 share = (1.0 - keep_heading) / self.headings
                 for h in range(self.headings):
                     self._collect(h, even, by0, bx0, share, limit, parts_keys, parts)
-            inside = float(mixed.sum(dtype=np.float64))
             keys, blocks = _merged(parts_keys, parts, self.index.shape)
             self._list(keys, blocks)
-            listed = float(blocks.sum(dtype=np.float64))
-            left = inside - self._blurred_mass(mixed, disc, by0, bx0)
-            self.off += left
-            self.rest += inside - left - listed
+            # What was too thin to list lies somewhere on the map; what left the grid is off it.
+            on_map = float(self._blurred(mixed, disc, by0, bx0).sum(dtype=np.float64))
+            self.rest += max(0.0, on_map - float(blocks.sum(dtype=np.float64)))
         self.off += before - (self.total() - self.off)
         self.leak()
         self.prune()
@@ -388,9 +386,6 @@ class Belief:
         out[max(0, self.shape[0] - by0 * BLOCK) :] = 0
         out[:, max(0, self.shape[1] - bx0 * BLOCK) :] = 0
         return out
-
-    def _blurred_mass(self, dense: F32, disc: F32, by0: int, bx0: int) -> float:
-        return float(self._blurred(dense, disc, by0, bx0).sum(dtype=np.float64))
 
     def _collect(
         self,

@@ -78,6 +78,13 @@ class GroundMap:
         return built / area, known / area
 
 
+def disc_pixels(radius_px: float) -> int:
+    """Number of pixels of a disc about a pixel's centre, by the centre rule."""
+    reach = math.floor(radius_px)
+    dx = np.arange(-reach, reach + 1, dtype=np.float64)
+    return int((dx[:, None] ** 2 + dx[None, :] ** 2 <= radius_px**2).sum())
+
+
 class RatioCache:
     """Counts of building and known pixels in discs about every pixel, or every cell, per step of radius.
 

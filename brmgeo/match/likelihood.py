@@ -114,7 +114,7 @@ class Rates:
 
 
 class RateLearner:
-    """P1 and P0 from registered views, and the independent area from how their errors clump.
+    """P1 and P0 from registered views: more careful than the settings where the views are worse, never more trusting.
 
     Counts are kept in independent areas, so that one view weighs about as much as the buildings it shows; the settings count
     as ``PRIOR`` such areas each, and old views fade.
@@ -141,8 +141,8 @@ class RateLearner:
         hit = float(self._hits[0] / self._hits.sum())
         alarm = float(self._alarms[0] / self._alarms.sum())
         # A map and masks that hardly agree must not talk the filter into believing anything.
-        hit = min(max(hit, 0.4), 0.98)
-        alarm = min(max(alarm, 0.003), 0.5 * hit)
+        hit = min(max(hit, 0.4), self._settings.hit)
+        alarm = max(min(alarm, 0.5 * hit), self._settings.false_alarm)
         self.rates = Rates(hit, alarm, unit)
 
     def _prior(self, share: float) -> F64:
@@ -406,40 +406,46 @@ def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, 
             out[i, j] = total
 
 
-class RingMatcher:
-    """Log-likelihood ratio of a view's rings at every cell of a grid; the same for all headings."""
+def ring_loglik(
+    rings: Rings, built: list[F32], known: list[F32], rates: Rates, settings: RatioSettings, cell: bool
+) -> F32:
+    """log p(rings | place), (rows, cols) float32, for maps of the ground in the discs of the rings' radii.
 
-    def __init__(self, settings: RatioSettings) -> None:
-        self._settings = settings
-
-    def score(self, rings: Rings, built: list[F32], known: list[F32], rates: Rates) -> F32:
-        """(rows, cols) float32 ratios.
-
-        Args:
-            rings: of the view.
-            built, known: square metres of the map in the discs of the same radii, (rows, cols) float32 each.
-            rates: P1, P0 and the independent area.
-        """
-        built_ring = np.diff(np.stack(built), axis=0, prepend=np.float32(0))
-        known_ring = np.diff(np.stack(known), axis=0, prepend=np.float32(0))
+    Args:
+        rings: of the view.
+        built, known: square metres of building and of known ground in each disc, (rows, cols) float32 each.
+        rates: P1, P0 and the independent area.
+        settings: floor and degrees of freedom.
+        cell: whether a place stands for its whole cell; the features' change within it then adds to their noise.
+    """
+    built_ring = np.diff(np.stack(built), axis=0, prepend=np.float32(0))
+    known_ring = np.diff(np.stack(known), axis=0, prepend=np.float32(0))
+    move = np.zeros(len(built_ring))
+    if cell:
         share = np.divide(built_ring, known_ring, out=np.zeros_like(built_ring), where=known_ring > 0)
-        # Half a cell of displacement changes a ring by about a third of what a whole cell does, in variance 1/12.
-        dx = np.diff(share, axis=2)
-        dy = np.diff(share, axis=1)
-        move = ((dx**2).mean(axis=(1, 2)) + (dy**2).mean(axis=(1, 2))).astype(np.float64) / 12.0
-        out = np.empty(built_ring.shape[1:], np.float32)
-        s = self._settings
-        split(
-            lambda i0, i1: _ring_loglik(
-                built_ring, known_ring, rings.share, rings.area_m2,
-                rates.hit, rates.false_alarm, rates.independent_m2, s.noise, move, s.dof, out, i0, i1,
-            ),
-            len(out),
-            64,
-        )  # fmt: skip
-        top = float(out.max())
-        own = top + math.log(float(np.exp(out - top, dtype=np.float64).mean()))
-        # Half the background is the map's own distribution, half an even spread of each ring's share over [0, 1]
-        # (density 1): where nothing on the map resembles the view, being off the map must win.
-        background = np.logaddexp(own, 0.0) - math.log(2.0)
-        return np.asarray(out - np.float32(background), np.float32)
+        # A place is spread evenly over its cell: a twelfth of the variance between neighbouring cells, per axis.
+        for axis in (1, 2):
+            move += (np.diff(share, axis=axis) ** 2).mean(axis=(1, 2), dtype=np.float64) / 12.0
+    out = np.empty(built_ring.shape[1:], np.float32)
+    split(
+        lambda i0, i1: _ring_loglik(
+            built_ring, known_ring, rings.share, rings.area_m2,
+            rates.hit, rates.false_alarm, rates.independent_m2, settings.noise, move, settings.dof, out, i0, i1,
+        ),
+        len(out),
+        64,
+    )  # fmt: skip
+    return out
+
+
+def ring_llr(
+    rings: Rings, built: list[F32], known: list[F32], rates: Rates, settings: RatioSettings
+) -> F32:
+    """(rows, cols) float32 log-likelihood ratio of a view's rings at every cell of a grid; see ``ring_loglik``."""
+    out = ring_loglik(rings, built, known, rates, settings, cell=True)
+    top = float(out.max())
+    own = top + math.log(float(np.exp(out - top, dtype=np.float64).mean()))
+    # Half the background is the map's own distribution, half an even spread of each ring's share over [0, 1]
+    # (density 1): where nothing on the map resembles the view, being off the map must win.
+    background = np.logaddexp(own, 0.0) - math.log(2.0)
+    return np.asarray(out - np.float32(background), np.float32)
