@@ -18,18 +18,19 @@ QGIS_VERSION = "3.22.0"
 Style = list[ET.Element]
 GEOMETRY_TYPES = {"Point": 0, "Line": 1, "Polygon": 2}
 
-# NGII building layers: the last digit of B001411x (older maps: 411x) tells the kind, and so does the Korean
-# name in the vector edition. Colours keep apart for colour-blind readers and stand out on imagery.
+# NGII building layers: the last digit of B001411x (older maps: 411x) tells the kind, and so do the names that
+# ingest gives and the Korean ones of the vector edition. Colours keep apart for colour-blind readers and stand
+# out on imagery.
 KINDS: tuple[tuple[str, tuple[str, ...], str, str], ...] = (
-    ("2", ("주택", "일반주택", "단독주택"), "House (주택)", "#f2a541"),
-    ("3", ("연립주택",), "Row house (연립주택)", "#e0662f"),
-    ("5", ("아파트",), "Apartments (아파트)", "#d45087"),
-    ("1", ("주택외건물",), "Non-residential (주택외건물)", "#4aa8e0"),
-    ("6", ("무벽건물",), "Canopy, no walls (무벽건물)", "#b8bcc4"),
-    ("7", ("온실",), "Greenhouse (온실)", "#3fb68b"),
-    ("8", ("가건물",), "Temporary (가건물)", "#f0e05a"),
-    ("4", ("공사중건물",), "Under construction (공사중건물)", "#a9714b"),
-    ("0", ("미분류", "건물"), "Unclassified building", "#9a86d6"),
+    ("2", ("house", "주택", "일반주택", "단독주택"), "House (주택)", "#f2a541"),
+    ("3", ("row-house", "연립주택"), "Row house (연립주택)", "#e0662f"),
+    ("5", ("apartment", "아파트"), "Apartments (아파트)", "#d45087"),
+    ("1", ("non-residential", "주택외건물"), "Non-residential (주택외건물)", "#4aa8e0"),
+    ("6", ("wall-less", "무벽건물"), "Canopy, no walls (무벽건물)", "#b8bcc4"),
+    ("7", ("greenhouse", "온실"), "Greenhouse (온실)", "#3fb68b"),
+    ("8", ("temporary", "가건물"), "Temporary (가건물)", "#f0e05a"),
+    ("4", ("under-construction", "공사중건물"), "Under construction (공사중건물)", "#a9714b"),
+    ("0", ("unclassified", "미분류", "건물"), "Unclassified building", "#9a86d6"),
 )
 OTHER_COLOUR = "#9a86d6"
 STATUS_COLOURS = {"converged": "#35e0c8", "ambiguous": "#ffb02e", "lost": "#ff5d5d"}
@@ -48,7 +49,7 @@ RATIO_STOPS: tuple[tuple[float, str, int], ...] = (
 
 
 def kind_of(value: str) -> tuple[str, str] | None:
-    """(label, colour) of an NGII layer code (``B0014112``, ``4112``) or Korean kind, None for anything else."""
+    """(label, colour) of an NGII layer code (``B0014112``, ``4112``) or of a kind (``house``), None for anything else."""
     code = value.strip().upper()
     digit = code[-1:] if code[:-1] in ("B001411", "411") else None
     for last, names, label, colour in KINDS:
@@ -379,9 +380,9 @@ def footprints_style(attribute: str | None, values: Sequence[str]) -> Style:
     known: list[tuple[str, str, str]] = []
     for _, _, label, colour in KINDS:
         known += [(v, label, colour) for v in sorted(values) if kind_of(v) == (label, colour)]
-    known += [(v, v, OTHER_COLOUR) for v in sorted(values) if kind_of(v) is None and v]
+    known += [(v, v.capitalize(), OTHER_COLOUR) for v in sorted(values) if kind_of(v) is None and v]
     categories = [(v, label, [fill(colour, 120, colour, 0.3)]) for v, label, colour in known]
-    categories.append(("", "Other", [fill("#8b93a1", 120, "#8b93a1", 0.3)]))
+    categories.append(("", "Other" if known else "Building", [fill("#8b93a1", 120, "#8b93a1", 0.3)]))
     return [categorized(attribute, categories)]
 
 

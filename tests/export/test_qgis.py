@@ -19,6 +19,7 @@ from brmgeo.export import qgis_style
 from brmgeo.export.candidates import write_candidates
 from brmgeo.export.qgis import style_footprints, write_flight_project, write_maps_project
 from brmgeo.export.trajectory import Track, write_trajectory
+from brmgeo.ingest.dxf import KIND_OF_LAYER
 
 CHECK = Path(__file__).parents[1] / "qgis" / "check_qgis.py"
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -142,9 +143,10 @@ def test_the_vector_file_carries_the_styles_and_keeps_its_features(region: Regio
 
 
 @pytest.mark.parametrize("digit", "012345678")
-def test_new_and_old_layer_codes_mean_the_same_kind(digit: str) -> None:
+def test_new_and_old_layer_codes_and_ingest_s_names_mean_the_same_kind(digit: str) -> None:
     assert qgis_style.kind_of(f"B001411{digit}") == qgis_style.kind_of(f"411{digit}")
     assert qgis_style.kind_of(f"411{digit}") is not None
+    assert qgis_style.kind_of(KIND_OF_LAYER[f"B001411{digit}"]) == qgis_style.kind_of(f"411{digit}")
     assert qgis_style.kind_of("B0014119") is None
     assert qgis_style.kind_of("shed") is None
 
