@@ -180,6 +180,200 @@ def why(region: str, stage: str, data: Path) -> None:
         click.echo(line)
 
 
+@cli.command()
+@click.argument("region", required=False)
+@data_option
+@scheduler_option
+@click.option("--maps", "maps_dir", type=DATA, help="Folder of built maps, in place of REGION.")
+@click.option(
+    "--out", type=DATA, help="The flight folder to write (default data/source/REGION/flights/NAME)."
+)
+@click.option("--name", help="Name of the flight (default simulated-SEED).")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option(
+    "--path",
+    default="rectangle",
+    show_default=True,
+    help="rectangle (1 075 m, the paper's), lawnmower, random, or a GeoJSON file.",
+)
+@click.option(
+    "--mode",
+    type=click.Choice(["masks", "frames", "both"]),
+    default="both",
+    show_default=True,
+    help="What the camera folder holds.",
+)
+@click.option(
+    "--scale-bias", type=float, help="Scale bias of the odometry, such as 0.05 (default: drawn, sigma 5 %)."
+)
+@click.option("--no-odometry", is_flag=True, help="Fly without odometry.")
+@click.option("--compass", is_flag=True, help="Write a compass heading (3 deg) into frames.csv.")
+def simulate(
+    region: str | None,
+    data: Path,
+    scheduler: str | None,
+    maps_dir: Path | None,
+    out: Path | None,
+    name: str | None,
+    seed: int,
+    path: str,
+    mode: str,
+    scale_bias: float | None,
+    no_odometry: bool,
+    compass: bool,
+) -> None:
+    """Simulate a flight over REGION: frames, masks, odometry, IMU, altimeter and reference in one folder."""
+    from pipelines import flights as job
+
+    own, folder, _ = job.maps_for("simulate", region, maps_dir, data, scheduler)
+    name = name or f"simulated-{seed}"
+    if out is None:
+        if region is None:
+            raise SettingsError("simulate --maps: give --out, the flight folder to write")
+        out = data / "source" / own.name / "flights" / name
+    job.simulate_flight(
+        job.read_maps(folder.absolute()),
+        out,
+        own.flight,
+        seed,
+        path,
+        mode,
+        scale_bias,
+        no_odometry,
+        compass,
+        name,
+    )
+    click.echo(f"wrote {out}")
+
+
+@cli.command()
+@click.argument("region", required=False)
+@data_option
+@scheduler_option
+@click.option(
+    "--maps",
+    "maps_dir",
+    type=DATA,
+    help="Folder of built maps (ratio.tif, buildings.tif), in place of REGION.",
+)
+@click.option(
+    "--flight", type=DATA, help="The flight folder; with a REGION, a simulated flight where not given."
+)
+@click.option("--method", type=click.Choice(METHODS), default="mask", show_default=True)
+@click.option("--out", type=DATA, help="Where results go (default data/out/REGION/flights/NAME/METHOD).")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the simulated flight."
+)
+@click.option("--compass", is_flag=True, help="Trust yaw_deg of frames.csv as a compass heading.")
+@click.option(
+    "--sift", is_flag=True, help="Also match the frames to the imagery by SIFT, the paper's Fig. 1."
+)
+def localize(
+    region: str | None,
+    data: Path,
+    scheduler: str | None,
+    maps_dir: Path | None,
+    flight: Path | None,
+    method: str,
+    out: Path | None,
+    seed: int,
+    compass: bool,
+    sift: bool,
+) -> None:
+    """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
+    from pipelines import flights as job
+
+    own, folder, attribution = job.maps_for("localize", region, maps_dir, data, scheduler)
+    if flight is None:
+        if region is None:
+            raise SettingsError("localize --maps: give --flight, the folder of the flight")
+        flight = job.default_flight(own, folder, data, seed)
+    if out is None:
+        if region is None:
+            raise SettingsError("localize --maps: give --out, the folder for the results")
+        out = data / "out" / own.name / "flights" / job.flight_name(flight) / method
+    job.localize(
+        folder,
+        flight,
+        method,
+        out,
+        flight_settings=own.flight,
+        compass=compass,
+        sift=sift,
+        attribution=attribution,
+    )
+
+
+@cli.command()
+@click.argument("region", required=False)
+@data_option
+@scheduler_option
+@click.option(
+    "--maps", "maps_dir", type=DATA, help="Folder of built maps (with footprints.gpkg), in place of REGION."
+)
+@click.option(
+    "--results", type=DATA, multiple=True, help="Compare what localize wrote below this folder; repeatable."
+)
+@click.option(
+    "--flights", type=click.IntRange(min=1), default=50, show_default=True, help="Simulated flights."
+)
+@click.option("--first-seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option("--methods", default=",".join(METHODS), show_default=True)
+@click.option(
+    "--path", default="rectangle", show_default=True, help="rectangle, lawnmower, random, or a GeoJSON file."
+)
+@click.option(
+    "--scale-bias",
+    type=float,
+    default=0.05,
+    show_default=True,
+    help="Of the odometry, with the sign drawn by seed.",
+)
+@click.option(
+    "--hide",
+    type=click.Choice(["east", "west", "north", "south"]),
+    help="Hide this half of the map and fly over it: nothing may be found.",
+)
+@click.option(
+    "--out", type=DATA, help="Where flights.csv and summary.md go (default data/out/REGION/evaluation)."
+)
+def evaluate(
+    region: str | None,
+    data: Path,
+    scheduler: str | None,
+    maps_dir: Path | None,
+    results: tuple[Path, ...],
+    flights: int,
+    first_seed: int,
+    methods: str,
+    path: str,
+    scale_bias: float,
+    hide: str | None,
+    out: Path | None,
+) -> None:
+    """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
+    from pipelines import flights as job
+
+    if results:
+        click.echo(job.compare_results(results, out))
+        return
+    own, folder, _ = job.maps_for("evaluate", region, maps_dir, data, scheduler)
+    if out is None:
+        if region is None:
+            raise SettingsError("evaluate --maps: give --out, the folder for the table")
+        out = (
+            data
+            / "out"
+            / own.name
+            / "evaluation"
+            / (f"hidden-{hide}" if hide else path if path in job.PATHS else "waypoints")
+        )
+    chosen = tuple(m.strip() for m in methods.split(",") if m.strip())
+    click.echo(
+        job.evaluate(folder, own.flight, flights, first_seed, chosen, path, scale_bias, hide, out, scheduler)
+    )
+
+
 def main() -> None:
     """Entry point of the ``brmgeo`` command."""
     sys.exit(run(lambda: cli(standalone_mode=False)))

@@ -707,9 +707,62 @@ def compare_results(folders: Sequence[Path], out: Path | None) -> str:
 # --- the jobs that the command line calls ----------------------------------------------------------------------
 
 
-def region_maps(name: str, data: Path, scheduler_spec: str | None) -> tuple[Region, Path]:
-    """A region and the folder of its maps, which are built first where they are not fresh."""
-    from pipelines.maps import build_region
+def maps_for(
+    command: str, region: str | None, maps_dir: Path | None, data: Path, scheduler_spec: str | None
+) -> tuple[Region, Path, str]:
+    """The region's settings, the folder of its maps (built first where they are not fresh), and its attribution.
 
-    region, data = region_named(name, data)
-    return region, build_region(name, data, None, False, scheduler_spec)
+    With ``maps_dir`` in place of a region the settings are the defaults.
+    """
+    from pipelines.maps import build_region, credits
+
+    if (region is None) == (maps_dir is None):
+        raise SettingsError(
+            f"{command}: give either a REGION (such as demo) or --maps with a folder of built maps"
+        )
+    if maps_dir is not None:
+        read_maps(maps_dir.absolute())
+        return (
+            Region.model_construct(name=_safe(maps_dir.absolute().name), flight=FlightSettings()),
+            maps_dir,
+            "",
+        )
+    assert region is not None
+    own, data = region_named(region, data)
+    return own, build_region(region, data, None, False, scheduler_spec), credits(own)
+
+
+def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
+    """The flight that is simulated when none is given: the paper's rectangle, frames and masks; made once a seed."""
+    name = f"simulated-{seed}"
+    out = data / "source" / own.name / "flights" / name
+    maps = read_maps(maps_dir.absolute())
+    mode = "both" if maps.imagery is not None else "masks"
+    recipe = json.dumps(
+        {
+            "seed": seed,
+            "mode": mode,
+            "flight": own.flight.model_dump(),
+            "footprints": _digest(maps.footprints),
+        }
+    )
+    note = out / ".recipe.json"
+    if not note.is_file() or note.read_text(encoding="utf-8") != recipe:
+        Progress().say(f"{name}: simulating the paper's rectangle over {own.name} (seed {seed})")
+        simulate_flight(maps, out, own.flight, seed, "rectangle", mode, None, False, False, name)
+        note.write_text(recipe, encoding="utf-8")
+    return out
+
+
+def _digest(path: Path | None) -> str:
+    import hashlib
+
+    if path is None:
+        return ""
+    with open(path, "rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def flight_name(folder: Path) -> str:
+    """The name that a flight's results go by."""
+    return _safe(read_flight(folder).name)

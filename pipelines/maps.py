@@ -477,7 +477,7 @@ def plan_maps(region: Region, store: Store, source_dir: Path) -> Plan:
         by_name,
         {"repairs_layer": own.repairs_layer},
     )
-    credits = _credits(region)
+    attribution = credits(region)
     metadata = {"region": region.name, "attribution": own.attribution, "terms": ""}
     imagery: Step | None = None
     if region.imagery is not None:
@@ -506,7 +506,9 @@ def plan_maps(region: Region, store: Store, source_dir: Path) -> Plan:
     if imagery is not None:
         inputs["imagery"] = imagery
     plan.add(
-        OVERVIEW, inputs, {"name": region.name, "title": region.title or region.name, "attribution": credits}
+        OVERVIEW,
+        inputs,
+        {"name": region.name, "title": region.title or region.name, "attribution": attribution},
     )
     return plan
 
@@ -646,7 +648,7 @@ def _sheets_bounds(region: Region) -> Bounds:
     return _bounds([*extents[:, :2].min(axis=0), *extents[:, 2:].max(axis=0)])
 
 
-def _credits(region: Region) -> str:
+def credits(region: Region) -> str:
     parts = [region.footprints.attribution, region.imagery.attribution if region.imagery else ""]
     return "; ".join(dict.fromkeys(p for p in parts if p))
 
@@ -701,7 +703,7 @@ def _write_facts(region: Region, made: Mapping[str, Artifact], path: Path) -> No
         "title": region.title,
         "crs": region.crs,
         "gsd_m": region.gsd_m,
-        "attribution": _credits(region),
+        "attribution": credits(region),
         "imagery_terms": region.imagery.terms if region.imagery else "",
         "stages": {
             label: {

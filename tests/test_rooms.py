@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-VALUES = {"brmgeo.errors", "brmgeo.region", "brmgeo.geo", "brmgeo.flight.values", "brmgeo.ingest.values"}
+VALUES = {"brmgeo.errors", "brmgeo.region", "brmgeo.geo", "brmgeo.flight.values", "brmgeo.flight.readings"}
 KERNELS = {
     "brmgeo.maps.ratio",
     "brmgeo.match",
@@ -17,7 +17,13 @@ KERNELS = {
     "brmgeo.flight.view",
     "brmgeo.flight.motion",
 }
-ADAPTERS = {"brmgeo.ingest", "brmgeo.export", "brmgeo.flight.folder", "brmgeo.flight.odometry"}
+ADAPTERS = {
+    "brmgeo.ingest",
+    "brmgeo.export",
+    "brmgeo.flight.folder",
+    "brmgeo.flight.odometry",
+    "brmgeo.flight.tables",
+}
 # What each room may import besides itself and plain values; everything not named here may not be known.
 MAY_KNOW = {
     "brmgeo.errors": set[str](),

@@ -78,7 +78,7 @@ class Window:
 
     def box_in(self, box: GeoBox) -> GeoBox:
         """This window's own lattice; also where it reaches outside ``box``."""
-        affine = box.affine * Affine.translation(self.col, self.row)
+        affine = box.affine @ Affine.translation(self.col, self.row)
         return GeoBox((self.height, self.width), affine, box.crs)
 
     @property
