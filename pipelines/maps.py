@@ -182,6 +182,7 @@ def read_lattice(folder: Path) -> tuple[GeoBox, tuple[tuple[str, shapely.Geometr
 def run_footprints(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     """Writes footprints.gpkg with the layers footprints, sheets and, when asked for, repairs."""
     from brmgeo.export.footprints import write_footprints_gpkg
+    from brmgeo.export.qgis import style_footprints
     from brmgeo.ingest.footprints import combine
 
     whole = combine([read_outlines(path) for path in inputs.values()])

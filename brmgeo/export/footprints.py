@@ -71,6 +71,7 @@ def write_footprints_gpkg(
                 geometry_type=kind,
                 append=draft.exists(),
                 SPATIAL_INDEX="YES",
+                VERSION="1.3",  # the newest that QGIS 3.22 (Debian 12) reads without a warning
             )
         # VACUUM leaves no freed pages behind, whose old contents would differ from run to run.
         with sqlite3.connect(draft) as database:
