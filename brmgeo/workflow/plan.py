@@ -5,12 +5,13 @@ Keys follow from sources and settings alone, so the whole plan is keyed without 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from brmgeo.errors import WorkflowError
+from brmgeo.errors import BrmgeoError, WorkflowError
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import serial_map
 from brmgeo.workflow.stage import Json, Map, Stage, canonical
@@ -64,20 +65,52 @@ class Plan:
     def build(self, map: Map = serial_map, progress: Progress | None = None) -> dict[str, Artifact]:
         """All artifacts by label; only what is missing runs. Hold ``store.lock(region)`` around it.
 
+        Neighbours of one stage that do not need each other (the files of a region) are built side by side by ``map``,
+        each wholly within one of its workers. Where some of them fail, the others are finished and kept first.
+
         Raises what the stages raise, see ``Store.build``.
         """
         progress = progress or Progress(quiet=True)
         made: dict[str, Artifact] = {}
-        for label, step in self.steps.items():
-            found = self.store.find(step)
-            if found is None:
-                with progress.stage(label) as bar:
-                    found = self.store.build(step, bar.watch(map))
-            else:
-                progress.fresh(label)
-            self.store.remember(self.region, step)
-            made[label] = found
+        for group in self._groups():
+            missing = [step for step in group if self.store.find(step) is None]
+            if len(missing) > 1:
+                with progress.stage(missing[0].stage.name) as bar:
+                    self._build_side_by_side(missing, bar.watch(map))
+            elif missing:
+                with progress.stage(missing[0].label) as bar:
+                    self.store.build(missing[0], bar.watch(map))
+            for step in group:
+                if step not in missing:
+                    progress.fresh(step.label)
+                self.store.remember(self.region, step)
+                made[step.label] = replace(self.store.build(step, map), fresh=step in missing)
         return made
+
+    def _groups(self) -> list[list[Step]]:
+        """The steps in order, neighbours of one stage together as long as none of them needs another."""
+        groups: list[list[Step]] = []
+        for step in self.steps.values():
+            group = groups[-1] if groups else []
+            if group and group[0].stage == step.stage and not any(i in group for i in step.inputs.values()):
+                group.append(step)
+            else:
+                groups.append([step])
+        return groups
+
+    def _build_side_by_side(self, steps: Sequence[Step], map: Map) -> None:
+        errors = []
+        for step, error in zip(steps, map(functools.partial(_build_alone, self.store.root), steps)):
+            if error is None:
+                self.store.remember(self.region, step)
+            else:
+                errors.append(error)
+        if len(errors) > 1:
+            raise type(errors[0])(
+                f"{errors[0]} (and {len(errors) - 1} more of {len(steps)} {steps[0].stage.name} failed)"
+            ) from errors[0]
+        if errors:
+            raise errors[0]
 
     def status(self, verify: bool = False) -> list[StepStatus]:
         """How each step stands; with ``verify`` the contents of all outputs are held against their records."""
@@ -115,6 +148,17 @@ class Plan:
         if before["key"] == step.key:
             return answer("missing", f"its outputs were removed from the store ({step.path})")
         return answer("stale", *changes(before, step.origin))
+
+
+def _build_alone(root: Path, step: Step) -> BrmgeoError | None:
+    """Builds one step within this process; an error of its input is returned, so that its neighbours go on."""
+    try:
+        Store(root).build(step, serial_map)
+    except WorkflowError:
+        raise  # a full disk or the like is no fault of this step alone
+    except BrmgeoError as error:
+        return error
+    return None
 
 
 def changes(before: Json, after: Json) -> list[str]:
