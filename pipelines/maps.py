@@ -7,9 +7,12 @@ The stages, in the order of the data: ``source`` (a generated region makes its o
 from __future__ import annotations
 
 import functools
+import glob
+import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from brmgeo.ingest.footprints import Footprints
 
 BLOCK_PX = 2048
+MAX_PIXELS = 200_000**2  # 100 x 100 km at 0.5 m: beyond that a stray outline is likelier than a region
 RASTER_SUFFIXES = (".tif", ".tiff", ".vrt", ".jpg", ".jpeg", ".png", ".jp2", ".img")
 VECTOR_SUFFIXES = (".dxf", ".shp", ".gpkg", ".geojson", ".json", ".parquet", ".fgb")
 Inputs = Mapping[str, Path]
@@ -69,6 +73,7 @@ def run_outlines(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     from brmgeo.ingest.repair import repair_counts
 
     path = inputs["file"] / settings["member"] if settings["member"] else inputs["file"]
+    name = settings["name"]
     read = read_footprints(
         path,
         settings["crs"],
@@ -81,18 +86,22 @@ def run_outlines(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         max_dropped_share=settings["max_dropped_share"],
     )
     if len(read.frame) and not settings["sheet"]:
-        check_extent(_bounds(read.frame.total_bounds), settings["crs"], settings["sheets"], what=path.name)
+        check_extent(_bounds(read.frame.total_bounds), settings["crs"], settings["sheets"], what=name)
+    # NGII's shapefiles all have one name: what two of them hold must still be told apart.
+    read.frame["source"] = name
+    read.sheets["source"] = name
     read.frame.to_parquet(out / "footprints.parquet")
     read.sheets.to_parquet(out / "sheets.parquet")
-    rest = {"counts": read.counts, "repairs": [asdict(r) for r in read.repairs]}
+    repairs = [asdict(r) | {"source": name} for r in read.repairs]
+    rest = {"counts": read.counts, "repairs": repairs}
     (out / "rest.json").write_text(json.dumps(rest, ensure_ascii=False), encoding="utf-8")
     examples: dict[str, list[Json]] = {}
-    for repair in read.repairs:
-        kept = examples.setdefault(repair.kind, [])
+    for repair in repairs:
+        kept = examples.setdefault(repair["kind"], [])
         if len(kept) < 3:
-            kept.append(asdict(repair))
+            kept.append(repair)
     return {
-        "file": path.name,
+        "file": name,
         "area_m2": round(float(read.frame.area.sum()), 2),
         "dropped_share": round(float(read.sheets["dropped_share"].max()), 6) if len(read.sheets) else 0.0,
         "counts": read.counts,
@@ -135,9 +144,12 @@ def run_lattice(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     else:
         read = [read_outlines(path) for path in inputs.values()]
         outlines = {r.sheets["outline"].iat[0] for r in read if len(r.sheets)}
-        if outlines == {"neatline"}:
-            known = [(r.sheets["source"].iat[0], r.sheets.geometry.iat[0]) for r in read]
-            basis = "neatlines of the sheets"
+        if outlines and outlines <= {"neatline", "number"}:
+            known = [
+                (r.sheets["sheet"].iat[0] or r.sheets["source"].iat[0], r.sheets.geometry.iat[0])
+                for r in read
+            ]
+            basis = "the files' own sheets (neatline or sheet number)"
         else:
             boxes = [r.frame.total_bounds for r in read if len(r.frame)]
             if not boxes:
@@ -152,6 +164,17 @@ def run_lattice(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
             )
     frame = _bounds(bounds if bounds is not None else shapely.total_bounds([p for _, p in known]))
     box = lattice(frame, crs, gsd_m)
+    if box.shape[0] * box.shape[1] > MAX_PIXELS:
+        raise SettingsError(
+            f"the region spans {(frame[2] - frame[0]) / 1000:.0f} x {(frame[3] - frame[1]) / 1000:.0f} km by its {basis}, "
+            f"{box.shape[1]} x {box.shape[0]} px: too many; state its bounds or a larger GSD, or look for stray outlines"
+        )
+    area = float(shapely.union_all([p for _, p in known]).intersection(shapely.box(*bounds_of(box))).area)
+    if area == 0.0:
+        raise SettingsError(
+            f"the region's bounds {_rounded(frame)} ({crs}) share no ground with its sheets {_listed(settings['sheets'])}; "
+            "correct the bounds, the sheets or the crs"
+        )
     text = {
         "crs": crs,
         "bounds": list(bounds_of(box)),
@@ -163,7 +186,7 @@ def run_lattice(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         "rows": box.shape[0],
         "cols": box.shape[1],
         "bounds": list(bounds_of(box)),
-        "known_area_m2": round(float(shapely.union_all([p for _, p in known]).area), 1),
+        "known_area_m2": round(area, 1),
         "known_area_from": basis,
     }
 
@@ -196,6 +219,7 @@ def run_footprints(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         whole.sheets,
         whole.repairs if settings["repairs_layer"] else None,
     )
+    style_footprints(out / "footprints.gpkg")
     return {
         "area_m2": round(float(shapely.union_all(whole.frame.geometry.values).area), 2),
         "counts": whole.counts,
@@ -213,7 +237,8 @@ def run_imagery(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
 
     box, _ = read_lattice(inputs["lattice"])
     source = json.dumps(settings["source"])
-    root = str(inputs["imagery"])
+    files = settings["source"]["files"]
+    root = str(inputs[files[0]].parent if files else inputs["imagery"])
     check_imagery(_imagery_sources(source, root), box)
     windows = list(blocks(_shape(box), BLOCK_PX))
     seen = 0
@@ -260,9 +285,8 @@ def _imagery_sources(source: str, root: str) -> list[Any]:
         return [TileFolder(folder, grid_named(settings["grid"]), settings["level"], settings["template"])]
     if settings["kind"] == "mbtiles":
         return [MBTiles.open(base, settings["level"])]
-    files = [base / name for name in settings["files"]] if settings["files"] else [base]
     found: list[Any] = []
-    for path in files:
+    for path in (base / name for name in settings["files"]):
         number = sheet_number_in(path.name)
         limits = None if settings["value_range"] is None else tuple(settings["value_range"])
         bands = None if settings["bands"] is None else tuple(settings["bands"])
@@ -420,22 +444,30 @@ PUBLISHED = {
 
 @dataclass(frozen=True, slots=True)
 class SourceFile:
-    """One file of footprints: where it is, as an input and a name below it, and the sheet that its name states."""
+    """One source of footprints: its files (``file`` and what belongs to it) or the folder that holds it as ``member``,
+    a name of its own among all, and the sheet that its path states."""
 
-    input: Input
+    inputs: Mapping[str, Input]
     member: str
     name: str
     sheet: str | None
 
 
-def plan_maps(region: Region, store: Store, source_dir: Path) -> Plan:
-    """The steps of a region's maps. Raises MissingInputError (which files, where they go, where to get them)."""
+def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = False) -> Plan:
+    """The steps of a region's maps; with ``fetch`` the tiles of a service that the user named are fetched for it.
+
+    Raises MissingInputError (which files or tiles, where they go, where to get them).
+    """
     require_projected_metres(region.crs)
     plan = Plan(store, region.name)
-    place = _bounds(region.bounds) if region.bounds is not None else None
+    place = region.bounds
     generated: Step | None = None
     if region.generate is not None:
-        bounds = place or _sheets_bounds(region)
+        if not region.sheets:
+            raise SettingsError(
+                f"region {region.name}: [generate] needs sheets, which the buildings are drawn on"
+            )
+        bounds = _place(region)
         generated = plan.add(
             SOURCE,
             {},
@@ -455,6 +487,7 @@ def plan_maps(region: Region, store: Store, source_dir: Path) -> Plan:
         label = label if label not in outlines else f"outlines {file.name}"
         settings = {
             "member": file.member,
+            "name": file.name,
             "crs": region.crs,
             "sheet": file.sheet,
             "sheets": region.sheets,
@@ -465,7 +498,7 @@ def plan_maps(region: Region, store: Store, source_dir: Path) -> Plan:
             "layer": own.layer,
             "encoding": own.encoding,
         }
-        outlines[label] = plan.add(OUTLINES, {"file": file.input}, settings, label)
+        outlines[label] = plan.add(OUTLINES, file.inputs, settings, label)
     by_name = {label.removeprefix("outlines "): step for label, step in outlines.items()}
     stated = bool(region.sheets) or place is not None
     grid = plan.add(
@@ -483,14 +516,14 @@ def plan_maps(region: Region, store: Store, source_dir: Path) -> Plan:
     imagery: Step | None = None
     if region.imagery is not None:
         given = region.imagery
-        source, settings = (
-            (generated, _imagery_settings(given, "tiles"))
+        sources, settings = (
+            ({"imagery": generated}, _imagery_settings(given, "tiles"))
             if generated
-            else _imagery_input(region, given, source_dir)
+            else _imagery_inputs(region, given, source_dir, fetch)
         )
         imagery = plan.add(
             IMAGERY,
-            {"lattice": grid, "imagery": source},
+            {"lattice": grid, **sources},
             {
                 "source": settings,
                 "compression": given.compression,
@@ -519,16 +552,24 @@ def find_sources(region: Region, source_dir: Path) -> list[SourceFile]:
     own = region.footprints
     found: dict[Path, None] = {}
     for pattern in own.paths:
-        absolute = Path(pattern)
-        matches = (
-            sorted(absolute.parent.glob(absolute.name))
-            if absolute.is_absolute()
-            else sorted(source_dir.glob(pattern))
-        )
-        found |= dict.fromkeys(p for p in matches if not p.name.startswith("."))
+        anchor = Path(pattern).anchor
+        below = (Path(anchor) if anchor else source_dir).glob(pattern[len(anchor) :])
+        found |= dict.fromkeys(sorted(p for p in below if not p.name.startswith(".") and p.is_file()))
+    alike = Counter(p.name for p in found)
     files = [
-        SourceFile(_whole(p), p.name if _whole(p) != p else "", p.name, _number_of(p, region)) for p in found
+        SourceFile(
+            _parts_of(p),
+            "",
+            p.name if alike[p.name] == 1 else f"{p.parent.name}/{p.name}",
+            _number_of(p, region),
+        )
+        for p in found
     ]
+    if len({f.name for f in files}) < len(files):
+        raise SettingsError(
+            f"region {region.name}: several footprint files are called {_twice(f.name for f in files)}; "
+            "rename their folders or put them together"
+        )
     covered = {f.sheet for f in files}
     missing = [s for s in region.sheets if s not in covered]
     if missing and (not files or covered != {None}):
@@ -557,24 +598,31 @@ def missing_sources(name: str, data: Path) -> list[str]:
     return []
 
 
-def _whole(path: Path) -> Path:
-    """What must be hashed for a file: a shapefile is all its parts, so its folder counts when it stands alone there."""
-    if path.suffix.lower() != ".shp":
-        return path
-    beside = [p for p in path.parent.iterdir() if not p.name.startswith(".")]
-    return path.parent if all(p.is_file() for p in beside) and len(beside) <= 64 else path
+def _twice(names: Iterable[str]) -> str:
+    return Counter(names).most_common(1)[0][0]
+
+
+def _parts_of(path: Path) -> dict[str, Input]:
+    """The file and, of a shapefile, those that belong to it: the key covers them all."""
+    parts: dict[str, Input] = {"file": path}
+    if path.suffix.lower() == ".shp":
+        for beside in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
+            if beside.suffix.lower() in (".shx", ".dbf", ".prj", ".cpg"):
+                parts[beside.suffix.lower()] = beside
+    return parts
 
 
 def _number_of(path: Path, region: Region) -> str | None:
-    """The sheet that a file's name states: one of the region's, else any that it could be."""
-    for number in sorted(region.sheets, key=len, reverse=True):
-        if number in path.name:
-            return number
+    """The sheet that a file's name (or, of NGII's shapefiles, its folder's) states: the region's, else any it could be."""
+    for name in (path.name, path.parent.name):
+        for number in sorted(region.sheets, key=len, reverse=True):
+            if number in name:
+                return number
     return sheet_number_in(path.name) if path.suffix.lower() == ".dxf" else None
 
 
 def _generated_files(region: Region, source: Step) -> list[SourceFile]:
-    return [SourceFile(source, f"sheets/{s}.dxf", f"{s}.dxf", s) for s in region.sheets]
+    return [SourceFile({"file": source}, f"sheets/{s}.dxf", f"{s}.dxf", s) for s in region.sheets]
 
 
 def _imagery_settings(given: ImagerySettings, member: str = "", files: Sequence[str] = ()) -> dict[str, Json]:
@@ -591,57 +639,104 @@ def _imagery_settings(given: ImagerySettings, member: str = "", files: Sequence[
     }
 
 
-def _imagery_input(region: Region, given: ImagerySettings, source_dir: Path) -> tuple[Path, dict[str, Json]]:
-    """The local files of an imagery source, fetched first where it is a service that the user named."""
+def _imagery_inputs(
+    region: Region, given: ImagerySettings, source_dir: Path, fetch: bool
+) -> tuple[dict[str, Input], dict[str, Json]]:
+    """The local files of an imagery source, by name, and what the stage must know of them."""
+    path = source_dir / given.path
+    if given.kind == "service":
+        cache = _service_tiles(region, given, source_dir, fetch)
+        return {"imagery": cache}, _imagery_settings(given)
+    if given.kind == "raster":
+        files = _rasters(region, path)
+        inputs: dict[str, Input] = {p.name: p for file in files for p in (file, *_beside(file))}
+        return inputs, _imagery_settings(given, files=[f.name for f in files])
+    if not path.exists():
+        raise MissingInputError(
+            f"region {region.name}: imagery is missing: {path} is not there; put "
+            f"{'a folder of tiles' if given.kind == 'tiles' else 'the MBTiles file'} there (grid {given.grid}, level "
+            f"{given.level}{_tile_range(region, given)}), or take [imagery] out of the region file"
+        )
+    from brmgeo.ingest.tiles import MBTiles, TileFolder, TileSource, ensure_tiles
+
+    source: TileSource
+    if given.kind == "mbtiles":
+        source = MBTiles.open(path, given.level)
+    else:
+        assert given.level is not None
+        source = TileFolder(path, grid_named(given.grid), given.level, given.template)
+    ensure_tiles(source, _place(region), region.crs, missing_ok=given.missing_share)
+    return {"imagery": path}, _imagery_settings(given)
+
+
+def _tile_range(region: Region, given: ImagerySettings) -> str:
+    if given.kind != "tiles" or given.level is None:
+        return ""
+    tiles = grid_named(given.grid).covering(_place(region), region.crs, given.level)
+    xs, ys = [t.x for t in tiles], [t.y for t in tiles]
+    return f": {len(tiles)} tiles, x {min(xs)}-{max(xs)}, y {min(ys)}-{max(ys)}"
+
+
+def _service_tiles(region: Region, given: ImagerySettings, source_dir: Path, fetch: bool) -> Path:
+    """The folder in which the tiles of a service are kept, filled when asked for."""
     from brmgeo.ingest.tiles import TileService, ensure_tiles
 
-    wanted = Path(given.path)
-    path = wanted if wanted.is_absolute() else source_dir / wanted
-    if given.kind == "service":
-        assert given.url is not None
-        assert given.level is not None
-        cache = source_dir / "cache" / f"{given.grid}-{given.level}"
-        service = TileService(
-            given.url,
-            grid_named(given.grid),
-            given.level,
-            cache,
-            max_connections=given.connections,
-            rate_per_s=given.rate_per_s,
-            retries=given.retries,
-            timeout_s=given.timeout_s,
-            key_env=given.key_env,
-            attribution=given.attribution,
-            terms=given.terms,
-            missing_ok=given.missing_share,
-        )
-        place = _bounds(region.bounds) if region.bounds is not None else _sheets_bounds(region)
-        with Progress().stage("imagery tiles") as bar:
-            ensure_tiles(service, place, region.crs, progress=bar.update)
-        return cache, _imagery_settings(given)
-    if given.kind in ("tiles", "mbtiles"):
-        if not path.exists():
+    assert given.url is not None
+    assert given.level is not None
+    name = f"{given.grid}-{given.level}-{hashlib.sha256(given.url.encode()).hexdigest()[:8]}"
+    cache = source_dir / "cache" / name
+    if not fetch:
+        if not cache.is_dir():
             raise MissingInputError(
-                f"region {region.name}: imagery is missing: {path} is not there; put "
-                f"{'a folder of tiles' if given.kind == 'tiles' else 'the MBTiles file'} there (grid {given.grid}, level "
-                f"{given.level}), or take [imagery] out of the region file"
+                f"region {region.name}: no tile of {given.url} has been fetched yet; "
+                f"`brmgeo maps {region.name}` fetches them into {cache}"
             )
-        return path, _imagery_settings(given)
-    files = sorted(path.parent.glob(path.name)) if not path.is_dir() else sorted(path.iterdir())
-    files = [f for f in files if f.suffix.lower() in RASTER_SUFFIXES]
+        return cache
+    service = TileService(
+        given.url,
+        grid_named(given.grid),
+        given.level,
+        cache,
+        max_connections=given.connections,
+        rate_per_s=given.rate_per_s,
+        retries=given.retries,
+        timeout_s=given.timeout_s,
+        key_env=given.key_env,
+        attribution=given.attribution,
+        terms=given.terms,
+        missing_ok=given.missing_share,
+    )
+    with Progress().stage("imagery tiles") as bar:
+        ensure_tiles(service, _place(region), region.crs, progress=bar.update)
+    return cache
+
+
+def _rasters(region: Region, path: Path) -> list[Path]:
+    """The images that a path, pattern or folder names; all in one folder."""
+    if path.is_file():
+        return [path]
+    found = path.iterdir() if path.is_dir() else path.parent.glob(path.name)
+    files = sorted(f for f in found if f.suffix.lower() in RASTER_SUFFIXES and not f.name.startswith("."))
     if not files:
         raise MissingInputError(
-            f"region {region.name}: imagery is missing: nothing at {path}; put GeoTIFFs, rasters with "
-            "world files or NGII ortho there, or take [imagery] out of the region file"
+            f"region {region.name}: imagery is missing: no image ({', '.join(RASTER_SUFFIXES)}) at {path}; put GeoTIFFs, "
+            "rasters with world files or NGII ortho there, or take [imagery] out of the region file"
         )
-    if len(files) == 1 and path.is_file() and not _has_companions(path):
-        return path, _imagery_settings(given)
-    root = path if path.is_dir() else path.parent
-    return root, _imagery_settings(given, files=[f.name for f in files])
+    return files
 
 
-def _has_companions(path: Path) -> bool:
-    return any(p != path and p.stem == path.stem for p in path.parent.iterdir())
+def _beside(image: Path) -> list[Path]:
+    """What else says where an image lies and how it looks: world files, .prj, .aux.xml, .ovr and the like."""
+    stem = glob.escape(image.stem)
+    return sorted(
+        p
+        for p in image.parent.glob(f"{stem}.*")
+        if p != image and p.is_file() and p.suffix.lower() not in (*RASTER_SUFFIXES, *VECTOR_SUFFIXES)
+    )
+
+
+def _place(region: Region) -> Bounds:
+    return _bounds(region.bounds) if region.bounds is not None else _sheets_bounds(region)
 
 
 def _sheets_bounds(region: Region) -> Bounds:
@@ -675,7 +770,7 @@ def build_maps(
     progress = Progress()
     store = Store(store_dir)
     with store.lock(region.name):
-        plan = plan_maps(region, store, source_dir)
+        plan = plan_maps(region, store, source_dir, fetch=True)
         with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
             made = plan.build(map, progress)
         if "source" in made:
@@ -755,7 +850,7 @@ def region_of_files(
         bounds=tuple(bounds) if bounds is not None else None,
         sheets=numbers,
         footprints=FootprintsSettings(
-            paths=tuple(str(p.absolute()) for p in files),
+            paths=tuple(glob.escape(str(p.absolute())) for p in files),
             layer=layer,
             encoding=encoding,
             repairs_layer=repairs,
