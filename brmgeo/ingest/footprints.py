@@ -8,12 +8,14 @@ two are one again.
 from __future__ import annotations
 
 import math
-import os
 import re
+import shutil
 import struct
+import tempfile
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -384,9 +386,9 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
                 _check_shapefile(path)
                 if encoding is None and not path.with_suffix(".cpg").exists():
                     encoding = "EUC-KR"
-            with _gdal_option("SHAPE_RESTORE_SHX", "YES" if os.access(path.parent, os.W_OK) else "NO"):
-                layer = layer or _only_layer(path)
-                frame = pyogrio.read_dataframe(path, layer=layer, encoding=encoding, on_invalid="ignore")
+            with _with_index(path) as whole:
+                layer = layer or _only_layer(whole)
+                frame = pyogrio.read_dataframe(whole, layer=layer, encoding=encoding, on_invalid="ignore")
     except InputError:
         raise
     except Exception as error:  # GDAL, pyarrow and geopandas raise many kinds on damaged files
@@ -397,6 +399,23 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
     if not isinstance(frame, gpd.GeoDataFrame):
         raise InputError(f"{path.name}: holds no geometry, only a table: give a file with building polygons")
     return frame
+
+
+@contextmanager
+def _with_index(path: Path) -> Iterator[Path]:
+    """The file itself, or, for a shapefile without .shx, a copy with one: nothing is ever written beside a source."""
+    if path.suffix.lower() != ".shp" or any(
+        p.suffix.lower() == ".shx" for p in path.parent.glob(f"{path.stem}.*")
+    ):
+        yield path
+        return
+    with (
+        tempfile.TemporaryDirectory(prefix="brmgeo-shp-") as folder,
+        _gdal_option("SHAPE_RESTORE_SHX", "YES"),
+    ):
+        for part in path.parent.glob(f"{path.stem}.*"):
+            shutil.copyfile(part, Path(folder) / part.name)
+        yield Path(folder) / path.name
 
 
 def _only_layer(path: Path) -> str:

@@ -145,8 +145,13 @@ def test_a_shapefile_without_prj_wants_a_crs(tmp_path):
 def test_a_shapefile_without_dbf_and_shx(tmp_path):
     path = write(town(), tmp_path / "t.shp")
     path.with_suffix(".dbf").unlink()
-    path.with_suffix(".shx").unlink()
+    beside = path.with_suffix(".shx").read_bytes(), path.with_suffix(".shx").stat().st_mtime_ns
     assert read_footprints(path, CRS).frame.area.sum() == pytest.approx(town().area.sum())
+    assert beside == (path.with_suffix(".shx").read_bytes(), path.with_suffix(".shx").stat().st_mtime_ns)
+    path.with_suffix(".shx").unlink()
+    before = sorted(p.name for p in tmp_path.iterdir())
+    assert read_footprints(path, CRS).frame.area.sum() == pytest.approx(town().area.sum())
+    assert sorted(p.name for p in tmp_path.iterdir()) == before, "nothing is written beside a source"
 
 
 @pytest.mark.parametrize("name", ["t.gpkg", "t.geojson", "t.shp", "t.parquet"])
