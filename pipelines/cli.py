@@ -387,7 +387,9 @@ def run(command: Callable[[], Any]) -> int:
         click.echo(f"brmgeo: {' '.join(str(error).split())}", err=True)
         return 2
     except click.ClickException as error:
-        error.show()
+        own = getattr(error, "ctx", None)
+        name = own.command_path if own else "brmgeo"
+        click.echo(f"{name}: {' '.join(error.format_message().split())}; see {name} --help", err=True)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
         click.echo(

@@ -11,6 +11,7 @@ import glob
 import hashlib
 import json
 import os
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -21,13 +22,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
+from pydantic import ValidationError
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import InputError, MissingInputError, SettingsError, WorkflowError
 from brmgeo.geo.crs import require_projected_metres
 from brmgeo.geo.grid import Bounds, Window, blocks, bounds_of, gsd_of, lattice
 from brmgeo.geo.sheets import check_extent, is_sheet_number, sheet_extent, sheet_number_in, sheet_polygon
 from brmgeo.geo.tilegrid import grid_named
-from brmgeo.region import FootprintsSettings, ImagerySettings, RatioSettings, Region
+from brmgeo.region import ImagerySettings, Region, describe_fault
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
@@ -768,6 +770,7 @@ def build_maps(
 ) -> Path:
     """Builds what is missing of a region's maps in the store and publishes everything in ``out``."""
     progress = Progress()
+    _require_writable(out)
     store = Store(store_dir)
     with store.lock(region.name):
         plan = plan_maps(region, store, source_dir, fetch=True)
@@ -786,6 +789,21 @@ def build_maps(
     else:
         progress.say(f"{region.name}: nothing to do, all {len(made)} stages are fresh; results are in {out}")
     return out
+
+
+def _require_writable(out: Path) -> None:
+    """Raises WorkflowError at once rather than after all the work."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        reason = (
+            "a file stands there"
+            if isinstance(error, (FileExistsError, NotADirectoryError))
+            else error.strerror
+        )
+        raise WorkflowError(f"results cannot be written to {out} ({reason}); choose another place") from None
 
 
 def _source_names(source: Artifact) -> list[str]:
@@ -841,25 +859,34 @@ def region_of_files(
             raise SettingsError(
                 f"--sheets: {number!r} is not an NGII sheet number of 5 to 9 digits, such as 36914093"
             )
-    files = [p for path in footprints for p in _files_of(path)]
-    return Region.model_construct(
-        name=_safe_name(out.absolute().name),
-        title=out.absolute().name,
-        crs=crs,
-        gsd_m=gsd_m,
-        bounds=tuple(bounds) if bounds is not None else None,
-        sheets=numbers,
-        footprints=FootprintsSettings(
-            paths=tuple(glob.escape(str(p.absolute())) for p in files),
-            layer=layer,
-            encoding=encoding,
-            repairs_layer=repairs,
-        ),
-        imagery=None if imagery is None else ImagerySettings(kind="raster", path=str(imagery.absolute())),
-        ratio=RatioSettings(n=3, agl_m=150.0, fov_deg=43.0)
-        if radii_m is None
-        else RatioSettings(radii_m=tuple(radii_m)),
-    )
+    files = dict.fromkeys(p.absolute() for path in footprints for p in _files_of(path))
+    name = out.absolute().name
+    asked: dict[str, Any] = {
+        "name": _safe_name(name),
+        "title": name,
+        "crs": crs.upper(),
+        "gsd_m": gsd_m,
+        "bounds": None if bounds is None else tuple(bounds),
+        "sheets": numbers,
+        "footprints": {
+            "paths": tuple(glob.escape(str(p)) for p in files),
+            "layer": layer,
+            "encoding": encoding,
+            "repairs_layer": repairs,
+        },
+        "imagery": None if imagery is None else {"kind": "raster", "path": str(imagery.absolute())},
+    }
+    if radii_m is not None:
+        asked["ratio"] = {"radii_m": tuple(radii_m)}
+    # A region file must say where the region is; here the footprints may.
+    placeless = bounds is None and not numbers
+    if placeless:
+        asked["bounds"] = (0.0, 0.0, 1.0, 1.0)
+    try:
+        region = Region.model_validate(asked)
+    except ValidationError as error:
+        raise SettingsError(f"maps --footprints: {describe_fault(error, Region)}") from None
+    return region.model_copy(update={"bounds": None}) if placeless else region
 
 
 def _files_of(path: Path) -> list[Path]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import re
-import shutil
+import tempfile
 from pathlib import Path
 
 from pyproj import Transformer
 
-from brmgeo.errors import SettingsError
+from brmgeo.errors import CrsError, SettingsError, WorkflowError
 from brmgeo.geo.crs import (
     LONLAT,
     belt_for_lon,
     belt_for_sheet,
+    crs_name,
     require_projected_metres,
     transform_bounds,
     transformer,
@@ -22,12 +25,13 @@ from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import sheet_extent, sheets_covering
 from brmgeo.region import Region, load_region
 
+MAX_AREA_M2 = 1e10
 NGII = "https://map.ngii.go.kr"
 
 _TEXT = """\
 # Region {name}: see data/regions/_template.toml for every key that a region can have.
 name = "{name}"
-title = "{title}"
+title = {title}
 crs = "{crs}"                # {crs_note}
 gsd_m = 0.5
 {bounds}sheets = [{sheets}]
@@ -81,6 +85,7 @@ def new_region(
         raise SettingsError(f"{path} exists: choose another name, or remove the file first")
     if bool(sheets) == (bounds is not None):
         raise SettingsError(f"new region {name}: give either --sheets or --bounds")
+    sheets = tuple(dict.fromkeys(sheets))
     text_bounds = ""
     if bounds is None:
         belts = sorted({belt_for_sheet(s) for s in sheets})
@@ -95,6 +100,11 @@ def new_region(
         note += f": x {left:.0f}..{right:.0f}, y {bottom:.0f}..{top:.0f}"
     else:
         crs, placed = _in_metres(name, bounds, bounds_crs)
+        if (placed[2] - placed[0]) * (placed[3] - placed[1]) > MAX_AREA_M2:
+            raise SettingsError(
+                f"new region {name}: bounds {bounds} span {(placed[2] - placed[0]) / 1000:.0f} x "
+                f"{(placed[3] - placed[1]) / 1000:.0f} km; a region has at most 100 x 100 km, give smaller bounds"
+            )
         sheets = tuple(sheets_covering(placed, crs))
         text_bounds = (
             f"bounds = [{', '.join(f'{v:.1f}' for v in placed)}]   # left, bottom, right, top in metres\n"
@@ -102,17 +112,23 @@ def new_region(
         note = "the belt at this longitude"
     text = _TEXT.format(
         name=name,
-        title=title or name,
+        title=json.dumps(title or name, ensure_ascii=False),  # TOML's strings are JSON's
         crs=crs,
         crs_note=note,
         bounds=text_bounds,
         sheets=", ".join(f'"{s}"' for s in sheets),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(text, encoding="utf-8")
-    shutil.move(part, path)
-    load_region(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as scratch:
+            draft = Path(scratch) / path.name
+            draft.write_text(text, encoding="utf-8")
+            load_region(draft)
+            os.replace(draft, path)
+    except OSError as error:
+        raise WorkflowError(
+            f"{path} cannot be written: {error.strerror}; choose another --data folder"
+        ) from None
     return path
 
 
@@ -128,20 +144,30 @@ def _in_metres(name: str, bounds: Bounds, bounds_crs: str) -> tuple[str, Bounds]
             raise SettingsError(
                 f"new region {name}: bounds {bounds} are not degrees; give --crs EPSG:... for bounds in metres"
             )
-        crs = belt_for_lon((left + right) / 2)
+        crs = _belt(name, (left + right) / 2)
         left, bottom, right, top = transform_bounds(LONLAT, crs, bounds)
     else:
         require_projected_metres(bounds_crs)
         to_lonlat: Transformer = transformer(bounds_crs, LONLAT)
         lon, _ = to_lonlat.transform((left + right) / 2, (bottom + top) / 2)
-        crs = bounds_crs
-        belt_for_lon(lon)  # sheets exist in Korea only: outside, this says so
+        crs = crs_name(bounds_crs)
+        _belt(name, lon)
     return crs, (
         float(math.floor(left)),
         float(math.floor(bottom)),
         float(math.ceil(right)),
         float(math.ceil(top)),
     )
+
+
+def _belt(name: str, lon_deg: float) -> str:
+    try:
+        return belt_for_lon(lon_deg)
+    except CrsError:
+        raise SettingsError(
+            f"new region {name}: longitude {lon_deg:.2f} lies outside Korea (123-133 E), where NGII's sheets are; elsewhere "
+            "copy data/regions/_template.toml and state crs, bounds and paths yourself, or use brmgeo maps --footprints"
+        ) from None
 
 
 def where_to_get(sheet: str) -> str:
