@@ -386,10 +386,13 @@ def run(command: Callable[[], Any]) -> int:
     except BrmgeoError as error:
         click.echo(f"brmgeo: {' '.join(str(error).split())}", err=True)
         return 2
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return error.exit_code
     except click.ClickException as error:
         own = getattr(error, "ctx", None)
         name = own.command_path if own else "brmgeo"
-        click.echo(f"{name}: {' '.join(error.format_message().split())}; see {name} --help", err=True)
+        click.echo(f"{name}: {' '.join(error.format_message().split()).rstrip('.')}; see {name} --help", err=True)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
         click.echo(
