@@ -104,8 +104,10 @@ def _mass_of(blocks):  # type: ignore[no-untyped-def]
     return out
 
 
-def _factor(llr: F32, low: float, high: float) -> F32:
+def _factor(llr: F32, low: float, high: float, weight: float) -> F32:
     """The bounded likelihood ratio, written over ``llr``: a frame is wrong as a whole with chance e^low."""
+    if weight != 1.0:
+        llr *= np.float32(weight)
     np.minimum(llr, np.float32(high), out=llr)
     np.exp(llr, out=llr)
     llr += np.float32(math.exp(low))
@@ -365,7 +367,16 @@ class Belief:
                     dense[i : i + BLOCK, j : j + BLOCK] = self.blocks[s]
                 mixed += dense
                 if keep_heading > 0:
-                    self._collect(h, self._blurred(dense, disc, by0, bx0), by0, bx0, keep_heading, limit, parts_keys, parts)
+                    self._collect(
+                        h,
+                        self._blurred(dense, disc, by0, bx0),
+                        by0,
+                        bx0,
+                        keep_heading,
+                        limit,
+                        parts_keys,
+                        parts,
+                    )
             if keep_heading < 1:
                 even = self._blurred(mixed, disc, by0, bx0)
                 share = (1.0 - keep_heading) / self.headings
@@ -413,22 +424,24 @@ class Belief:
         self._normalise()
         self.prune()
 
-    def update(self, llr: F32, low: float, high: float) -> float:
+    def update(self, llr: F32, low: float, high: float, weight: float = 1.0) -> float:
         """Weigh listed blocks by (n, 16, 16) log-likelihood ratios, which are overwritten; returns the log of the evidence."""
-        self.blocks *= _factor(llr, low, high)
+        self.blocks *= _factor(llr, low, high, weight)
         self.blocks[self.blocks < 1e-25] = 0.0
         total = self._normalise()
         self.prune()
         return math.log(total)
 
-    def search(self, llr_of: Callable[[int], F32 | None], low: float, high: float, heading_prior: F64 | None = None) -> float:
+    def search(
+        self, llr_of: Callable[[int], F32 | None], low: float, high: float, weight: float = 1.0
+    ) -> float:
         """Weigh the whole grid, unlisted ground included, and list what stands out; returns the log of the evidence.
 
         Args:
             llr_of: gives the (rows, cols) float32 log-likelihood ratios of one heading bin, which are overwritten, or
                 None to rule the heading out.
             low, high: bounds of the ratios.
-            heading_prior: (headings,) mean 1, how ``rest`` is spread over headings; None for evenly.
+            weight: factor of the ratios, for views that repeat what was seen.
         """
         # Headings arrive one by one, so the total is not yet known: what an even spread held is the first threshold.
         threshold = self.settings.keep * self._even_block
@@ -442,9 +455,8 @@ class Belief:
             llr = llr_of(h)
             if llr is None:
                 continue
-            weight = 1.0 if heading_prior is None else float(heading_prior[h])
-            even = np.float32(self.rest * weight / self.cells)
-            factor = _factor(llr, low, high)
+            even = np.float32(self.rest / self.cells)
+            factor = _factor(llr, low, high, weight)
             _search_heading(factor, self.index[h], self.blocks, even, masses)
             mass_all += float(masses.sum())
             cells = np.argwhere(masses > threshold)

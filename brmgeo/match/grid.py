@@ -67,6 +67,7 @@ class GridMatcher(ABC):
         self.belief = Belief((-(-h // self.cell_px), -(-w // self.cell_px)), settings.belief)
         self.track: Track | None = None
         self._misses = 0
+        self._confirmed = False
         self._unfixed_searches = 0
         self._since_informed_m = 0.0
         self._views: list[View] = []
@@ -80,7 +81,9 @@ class GridMatcher(ABC):
         """Prepare for scoring one view."""
 
     @abstractmethod
-    def _score_all(self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]) -> Callable[[int], F32 | None]:
+    def _score_all(
+        self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
+    ) -> Callable[[int], F32 | None]:
         """A function of the heading bin that gives ratios of all cells; asked for in order of bins."""
 
     @abstractmethod
@@ -94,6 +97,14 @@ class GridMatcher(ABC):
     @abstractmethod
     def _bounds(self) -> tuple[float, float]:
         """Bounds of one frame's ratio."""
+
+    @abstractmethod
+    def _evidence(self, view: View) -> tuple[float, float]:
+        """Ground that the evidence comes from, square metres, and its weight per share of new ground."""
+
+    def _confirms(self) -> bool:
+        """Whether a first fix needs a measured pose."""
+        return False
 
     def _learn(self, view: View, anchor: Anchor) -> None:
         """Adapt to a view whose pose is well known."""
@@ -123,7 +134,7 @@ class GridMatcher(ABC):
     def _predict(self, motion: Motion) -> None:
         odo = self.settings.odometry
         if motion.step_m is None:
-            self.track = None
+            self.track, self._confirmed = None, False
             radius = max(1.0, odo.max_speed_m_s * motion.dt_s / self.cell_m)
             keep = odo.reset_keeps_heading if motion.yaw_rad is not None else 0.0
             self.belief.predict_unknown(radius, keep)
@@ -156,22 +167,34 @@ class GridMatcher(ABC):
 
     def _update(self, view: View, motion: Motion) -> None:
         low, high = self._bounds()
+        weight = self._novelty(view, motion)
         yaw = motion.yaw_rad
         known = self.belief.rest > 1e-3
         # Flying where the map does not reach must not cost a search each frame.
-        if known and (self._unfixed_searches < 15 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)):
+        if known and (
+            self._unfixed_searches < 15 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)
+        ):
             wanted = np.ones(self.belief.headings, np.bool_)
             score = self._score_all(view, yaw if yaw is not None else 0.0, wanted)
             if yaw is None and motion.step_m is not None:
                 score = self._any_heading(score)
-            gain = self.belief.search(score, low, high)
+            gain = self.belief.search(score, low, high, weight)
         elif yaw is None and motion.step_m is not None:
-            gain = self._update_any_heading(view, low, high)
+            gain = self._update_any_heading(view, low, high, weight)
         else:
-            gain = self.belief.update(self._score_listed(view, yaw if yaw is not None else 0.0), low, high)
+            listed = self._score_listed(view, yaw if yaw is not None else 0.0)
+            gain = self.belief.update(listed, low, high, weight)
         self._unfixed_searches += 1
         if gain > 2.0:
             self._since_informed_m = 0.0
+
+    def _novelty(self, view: View, motion: Motion) -> float:
+        """Weight of the view's evidence: by the share of it that the view before did not show; 1 where that is unknown."""
+        if len(self._views) < 2 or motion.step_m is None:
+            return 1.0
+        area, repeat = self._evidence(view)
+        # Even a view of old ground says a little: its mask has errors of its own.
+        return min(1.0, max(0.02, repeat * float(np.hypot(*motion.step_m)) / math.sqrt(max(area, 1.0))))
 
     def _any_heading(self, score: Callable[[int], F32 | None]) -> Callable[[int], F32 | None]:
         """Ratios where the body's heading is unknown but the odometry's is not: the mean over headings, for all."""
@@ -184,7 +207,7 @@ class GridMatcher(ABC):
         mean = np.asarray(top - math.log(self.belief.headings), np.float32)
         return lambda h: mean.copy()
 
-    def _update_any_heading(self, view: View, low: float, high: float) -> float:
+    def _update_any_heading(self, view: View, low: float, high: float, weight: float) -> float:
         """The same at listed blocks: every place that is listed under any heading is scored under all."""
         belief = self.belief
         places, inverse = np.unique(belief.keys[:, 1:], axis=0, return_inverse=True)
@@ -200,21 +223,28 @@ class GridMatcher(ABC):
             belief.keys = keys
         if total is None:
             return 0.0
-        return belief.update(np.ascontiguousarray((total - np.float32(math.log(n)))[inverse.ravel()]), low, high)
+        llr = np.ascontiguousarray((total - np.float32(math.log(n)))[inverse.ravel()])
+        return belief.update(llr, low, high, weight)
 
     # From belief to estimate
 
     def _world(self, cell: F64) -> F64:
         """x, y of (..., 2) cell coordinates (row, col)."""
         return np.stack(
-            [self.ground.left + cell[..., 1] * self.cell_m, self.ground.top - cell[..., 0] * self.cell_m], axis=-1
+            [self.ground.left + cell[..., 1] * self.cell_m, self.ground.top - cell[..., 0] * self.cell_m],
+            axis=-1,
         )
 
     def _estimate(self, view: View, motion: Motion, mode: Mode | None) -> Estimate:
         s = self.settings.belief
         belief = self.belief
         cells, mass, count = belief.heaviest(s.candidates)
-        extra = {"entropy": belief.entropy(), "off_map": belief.off, "unlisted": belief.rest, "listed_blocks": float(len(belief.keys))}
+        extra = {
+            "entropy": belief.entropy(),
+            "off_map": belief.off,
+            "unlisted": belief.rest,
+            "listed_blocks": float(len(belief.keys)),
+        }
         if mode is None:
             h, w = self.ground.building.shape
             g = self.ground.gsd_m
@@ -222,7 +252,17 @@ class GridMatcher(ABC):
             spread = np.diag([(w * g) ** 2, (h * g) ** 2]) / 12.0
             status: Status = "lost" if belief.off > s.lost_mass else "ambiguous"
             return Estimate(
-                view.t_s, status, middle, spread, math.nan, math.nan, 0.0, np.empty((0, 2)), np.empty(0), 0, extra
+                view.t_s,
+                status,
+                middle,
+                spread,
+                math.nan,
+                math.nan,
+                0.0,
+                np.empty((0, 2)),
+                np.empty(0),
+                0,
+                extra,
             )
         mean = self._world(mode.mean)
         r, c = mode.covariance[0, 0], mode.covariance[1, 1]
@@ -232,12 +272,14 @@ class GridMatcher(ABC):
         sure = mode.mass > s.converged_mass
         if sure:
             mean, cov, heading, heading_sigma = self._follow(view, motion, mean, cov, heading, heading_sigma)
-        elif self.track is not None and mode.mass < 0.5:
-            self.track = None
+        elif mode.mass < 0.5:
+            self.track, self._confirmed = None, False
         if self.track is not None:
             extra["scale"] = math.exp(float(self.track.mean[3]))
+        # The part of the levelling error that lasts the whole flight is averaged away by no filter.
+        cov = cov + np.eye(2) * (self.settings.odometry.attitude_sigma_rad * view.agl_m) ** 2
         sigma = math.sqrt(float(np.trace(cov)) / 2.0)
-        if sure and sigma <= s.converged_sigma_m:
+        if sure and sigma <= s.converged_sigma_m and (self._confirmed or not self._confirms()):
             status = "converged"
             self._unfixed_searches = 0
         else:
@@ -263,7 +305,7 @@ class GridMatcher(ABC):
             spread = cov + self.track.covariance[:2, :2] + np.eye(2) * self.cell_m**2
             if float(apart @ np.linalg.solve(spread, apart)) > 16.0:
                 # The belief is the judge: a track that left the one place it knows is wrong.
-                self.track = None
+                self.track, self._confirmed = None, False
         fresh = self.track is None
         if self.track is None:
             sigma_s = odo.scale_sigma
@@ -287,15 +329,20 @@ class GridMatcher(ABC):
             d2 = track.distance2(anchor.pose, anchor.covariance, turn)
             if d2 < 16.3 or fresh:
                 track.update(anchor.pose, anchor.covariance, turn)
-                self._misses = 0
+                self._misses, self._confirmed = 0, True
                 self._anchors[-1] = anchor
                 self._learn(view, anchor)
             else:
                 self._misses += 1
                 if self._misses >= 3:
-                    self.track = None
+                    self.track, self._confirmed = None, False
                     self._misses = 0
-        result = (track.mean[:2].copy(), track.covariance[:2, :2].copy(), float(track.mean[2]), math.sqrt(float(track.covariance[2, 2])))
+        result = (
+            track.mean[:2].copy(),
+            track.covariance[:2, :2].copy(),
+            float(track.mean[2]),
+            math.sqrt(float(track.covariance[2, 2])),
+        )
         if motion.step_m is None and body is None:
             self.track = None
         return result
@@ -304,6 +351,7 @@ class GridMatcher(ABC):
 
     def smooth(self) -> SmoothedPath:
         """The most likely path of the whole flight so far, also before the first fix; see ``brmgeo.match.smooth``."""
+
         def register(i: int, pose: F64, covariance: F64) -> Anchor | None:
             anchor = self._measure(_unpacked(self._views[i]), pose, covariance)
             if anchor is None:
@@ -313,9 +361,11 @@ class GridMatcher(ABC):
             d2 = float(error @ np.linalg.solve(covariance + anchor.covariance, error))
             return anchor if d2 < 16.3 else None
 
-        return smooth_path(
+        path = smooth_path(
             [v.t_s for v in self._views], self._motions, self._anchors, self.settings.odometry, register
         )
+        tilt = np.array([self.settings.odometry.attitude_sigma_rad * v.agl_m for v in self._views])
+        return SmoothedPath(path.t_s, path.xy, path.yaw_rad, np.hypot(path.sigma_m, tilt))
 
 
 def _packed(view: View) -> View:
@@ -326,4 +376,6 @@ def _packed(view: View) -> View:
 
 def _unpacked(view: View) -> View:
     building = view.building.astype(np.float32) / np.float32(255)
-    return View(view.t_s, building, view.known, view.gsd_m, view.nadir_px, view.agl_m, view.radius_m, view.file)
+    return View(
+        view.t_s, building, view.known, view.gsd_m, view.nadir_px, view.agl_m, view.radius_m, view.file
+    )

@@ -192,7 +192,18 @@ def mask_templates(
     shown = wanted
     split(
         lambda h0, h1: _splat(
-            points.forward, points.left, points.built, points.known, yaw_rad, shown, cell_m, reach, k, w, h0, h1
+            points.forward,
+            points.left,
+            points.built,
+            points.known,
+            yaw_rad,
+            shown,
+            cell_m,
+            reach,
+            k,
+            w,
+            h0,
+            h1,
         ),
         len(yaw_rad),
         8 if shown.sum() > 16 else len(yaw_rad),
@@ -278,9 +289,7 @@ class MapCover:
         for r, c, h, w in self._tiles:
             cut = built[r : r + h + 2 * reach, c : c + w + 2 * reach]
             # Without a building in reach the correlation with ``a`` is zero; without room to keep it, it is made anew.
-            self._spectra.append(
-                scipy.fft.rfft2(cut, s=self._size) if keep and cut.any() else None
-            )
+            self._spectra.append(scipy.fft.rfft2(cut, s=self._size) if keep and cut.any() else None)
         self._keep = keep
         n, m = -(-known.shape[0] // 4), -(-known.shape[1] // 4)
         wide = np.zeros((n * 4, m * 4), np.float32)
@@ -376,7 +385,9 @@ def view_rings(view: View, count: int) -> Rings:
     index = np.minimum(np.ceil(ring).astype(np.int64) - 1, count).clip(0)
     known = view.known
     n = np.bincount(index[known], minlength=count + 1)[:count].astype(np.float64)
-    k = np.bincount(index[known], weights=view.building[known].astype(np.float64), minlength=count + 1)[:count]
+    k = np.bincount(index[known], weights=view.building[known].astype(np.float64), minlength=count + 1)[
+        :count
+    ]
     share = np.divide(k, n, out=np.zeros(count), where=n > 0)
     radius = view.radius_m * (np.arange(count) + 1) / count
     return Rings(share, n * view.gsd_m**2, radius)
@@ -438,9 +449,7 @@ def ring_loglik(
     return out
 
 
-def ring_llr(
-    rings: Rings, built: list[F32], known: list[F32], rates: Rates, settings: RatioSettings
-) -> F32:
+def ring_llr(rings: Rings, built: list[F32], known: list[F32], rates: Rates, settings: RatioSettings) -> F32:
     """(rows, cols) float32 log-likelihood ratio of a view's rings at every cell of a grid; see ``ring_loglik``."""
     out = ring_loglik(rings, built, known, rates, settings, cell=True)
     top = float(out.max())

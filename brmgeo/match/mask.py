@@ -33,6 +33,12 @@ class MaskMatcher(GridMatcher):
     def _bounds(self) -> tuple[float, float]:
         return self.settings.rates.llr_min, self.settings.rates.llr_max
 
+    def _confirms(self) -> bool:
+        return True
+
+    def _evidence(self, view: View) -> tuple[float, float]:
+        return float(np.count_nonzero(view.known)) * view.gsd_m**2, self.settings.rates.repeat
+
     def _look(self, view: View) -> None:
         # Patches of half a cell, their area shared between cells, keep the patches' own size out of the templates.
         self._points = view_points(view, self.cell_m / 2.0)
@@ -64,7 +70,12 @@ class MaskMatcher(GridMatcher):
             return None
         if max(found.covariance[0, 0], found.covariance[1, 1]) > 9.0:
             return None
-        return Anchor(found.pose, found.covariance)
+        on_both, missed, extra, _ = found.counts
+        if 2 * on_both < self.settings.rates.least_fit * (2 * on_both + missed + extra):
+            return None
+        # The frame's own share of the levelling error; the flight's own is added to what is reported.
+        tilt = (self.settings.odometry.attitude_sigma_rad * view.agl_m) ** 2
+        return Anchor(found.pose, found.covariance + np.diag([tilt, tilt, 0.0]))
 
     def _learn(self, view: View, anchor: Anchor) -> None:
         assert self._points is not None

@@ -167,7 +167,9 @@ class RingReach:
         """
         starts, ends, counts, left = self._starts, self._ends, self._counts, self._left
         split(lambda i0, i1: _runs(mask, starts, ends, counts, i0, i1), len(counts), 64)
-        split(lambda i0, i1: _keep_reached(starts, ends, counts, spans, reach, out, left, i0, i1), len(left), 64)
+        split(
+            lambda i0, i1: _keep_reached(starts, ends, counts, spans, reach, out, left, i0, i1), len(left), 64
+        )
         return int(left.sum())
 
 
@@ -215,7 +217,9 @@ def _follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distanc
         for a in range(theta_start[p], theta_start[p + 1]):
             x = c + distance * math.cos(theta[a])
             y = r - distance * math.sin(theta[a])
-            for i in range(max(0, int(math.floor(y - eps)) + 1), min(rows - 1, int(math.ceil(y + eps)) - 1) + 1):
+            for i in range(
+                max(0, int(math.floor(y - eps)) + 1), min(rows - 1, int(math.ceil(y + eps)) - 1) + 1
+            ):
                 lo, hi = row_start[i], row_start[i + 1]
                 end = hi
                 # First candidate of the row right of the box's left side.
@@ -361,7 +365,9 @@ class PaperMatcher:
             dx = place[1] - before[:, 1].astype(np.float64)
             dy = before[:, 0].astype(np.float64) - place[0]
             theta = np.arctan2(dy, dx)
-            near = (np.abs(dx - distance * np.cos(theta)) < eps) & (np.abs(dy - distance * np.sin(theta)) < eps)
+            near = (np.abs(dx - distance * np.cos(theta)) < eps) & (
+                np.abs(dy - distance * np.sin(theta)) < eps
+            )
             chunks.append(theta[near])
             starts.append(starts[-1] + int(near.sum()))
             if starts[-1] > len(self._pairs):
@@ -409,7 +415,17 @@ class PaperMatcher:
             spread = np.diag([(cols * g) ** 2, (rows * g) ** 2]) / 12.0
             self._anchors.append(None)
             return Estimate(
-                view.t_s, "lost", middle, spread, math.nan, math.nan, 0.0, np.empty((0, 2)), np.empty(0), 0, extra
+                view.t_s,
+                "lost",
+                middle,
+                spread,
+                math.nan,
+                math.nan,
+                0.0,
+                np.empty((0, 2)),
+                np.empty(0),
+                0,
+                extra,
             )
         by_row, by_col = np.count_nonzero(self._before, axis=1), np.count_nonzero(self._before, axis=0)
         y = self.ground.top - (np.arange(rows) + 0.5) * g
@@ -418,7 +434,9 @@ class PaperMatcher:
         var = np.array([by_col @ (x - mean[0]) ** 2, by_row @ (y - mean[1]) ** 2]) / self._count
         # Far candidates along one axis alone already forbid convergence; the distance is checked only if they do not.
         r, c = np.flatnonzero(by_row), np.flatnonzero(by_col)
-        half = max(abs(y[r[0]] - mean[1]), abs(y[r[-1]] - mean[1]), abs(x[c[0]] - mean[0]), abs(x[c[-1]] - mean[0]))
+        half = max(
+            abs(y[r[0]] - mean[1]), abs(y[r[-1]] - mean[1]), abs(x[c[0]] - mean[0]), abs(x[c[-1]] - mean[0])
+        )
         flat = np.flatnonzero(self._before)
         status: Status = "ambiguous"
         if half <= s.d_max_m:

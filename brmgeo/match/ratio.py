@@ -29,11 +29,14 @@ class RatioMatcher(GridMatcher):
         super().__init__(ground, settings)
         self._cache = RatioCache(ground, settings.ratio.radius_step, self.cell_px)
         r = settings.rates
-        self._rates = Rates(r.hit, r.false_alarm, r.independent_m2)
+        self._rates = Rates(r.hit, r.false_alarm, settings.ratio.independent_m2)
         self._llr = np.zeros(self.belief.shape, np.float32)
 
     def _bounds(self) -> tuple[float, float]:
         return self.settings.rates.llr_min, self.settings.rates.llr_max
+
+    def _evidence(self, view: View) -> tuple[float, float]:
+        return math.pi * view.radius_m**2, self.settings.ratio.repeat
 
     def _look(self, view: View) -> None:
         rings = view_rings(view, self.settings.ratio.radii)
@@ -74,8 +77,15 @@ class RatioMatcher(GridMatcher):
             return None
         reach = half + halo
         cut = np.full((2 * reach + 1, 2 * reach + 1), UNKNOWN, np.uint8)
-        r0, r1, c0, c1 = max(0, row - reach), min(h, row + reach + 1), max(0, col - reach), min(w, col + reach + 1)
-        cut[r0 - row + reach : r1 - row + reach, c0 - col + reach : c1 - col + reach] = g.building[r0:r1, c0:c1]
+        r0, r1, c0, c1 = (
+            max(0, row - reach),
+            min(h, row + reach + 1),
+            max(0, col - reach),
+            min(w, col + reach + 1),
+        )
+        cut[r0 - row + reach : r1 - row + reach, c0 - col + reach : c1 - col + reach] = g.building[
+            r0:r1, c0:c1
+        ]
         inner = slice(halo, halo + 2 * half + 1, stride)
         area = np.float32(g.gsd_m**2)
         built, known = [], []
@@ -86,13 +96,22 @@ class RatioMatcher(GridMatcher):
             if whole:
                 known.append(np.full(counts.shape, area * disc_pixels(float(radius) / g.gsd_m), np.float32))
             else:
-                known.append(disc_counts(cut != UNKNOWN, float(radius) / g.gsd_m)[inner, inner].astype(np.float32) * area)
-        loglik = ring_loglik(rings, built, known, self._rates, self.settings.ratio, cell=False).astype(np.float64)
+                known.append(
+                    disc_counts(cut != UNKNOWN, float(radius) / g.gsd_m)[inner, inner].astype(np.float32)
+                    * area
+                )
+        loglik = ring_loglik(rings, built, known, self._rates, self.settings.ratio, cell=False).astype(
+            np.float64
+        )
         offset = np.arange(-half, half + 1, stride)
         x = g.left + (col + offset + 0.5) * g.gsd_m - pose[0]
         y = g.top - (row + offset + 0.5) * g.gsd_m - pose[1]
         inverse = np.linalg.inv(prior)
-        quad = inverse[0, 0] * x[None, :] ** 2 + 2 * inverse[0, 1] * x[None, :] * y[:, None] + inverse[1, 1] * y[:, None] ** 2
+        quad = (
+            inverse[0, 0] * x[None, :] ** 2
+            + 2 * inverse[0, 1] * x[None, :] * y[:, None]
+            + inverse[1, 1] * y[:, None] ** 2
+        )
         log = loglik - 0.5 * quad
         p = np.exp(log - log.max())
         p /= p.sum()

@@ -168,7 +168,20 @@ class Registrar:
         whole = bool(shares[1].min() >= 0.9999)
         split(
             lambda h0, h1: _offsets(
-                *shares, whole, points.forward, points.left, a, b, row, col, 1.0 / cell, yaw, half, out, h0, h1
+                *shares,
+                whole,
+                points.forward,
+                points.left,
+                a,
+                b,
+                row,
+                col,
+                1.0 / cell,
+                yaw,
+                half,
+                out,
+                h0,
+                h1,
             ),
             len(yaw),
             2,

@@ -14,7 +14,9 @@ def _check(owner: Any, **ranges: tuple[float, float]) -> None:
         value = getattr(owner, name)
         if not (math.isfinite(value) and low <= value <= high):
             kind = type(owner).__name__
-            raise SettingsError(f"{kind}.{name} = {value!r} is outside [{low}, {high}]: choose a value inside")
+            raise SettingsError(
+                f"{kind}.{name} = {value!r} is outside [{low}, {high}]: choose a value inside"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +31,8 @@ class OdometrySettings:
         step_sigma_m: noise of a step per axis that does not depend on its length, metres, [0, 100].
         step_sigma_share: noise of a step per axis as a share of its length, [0, 1].
         max_speed_m_s: bound of the movement where odometry says nothing, metres per second, [0.1, 500].
+        attitude_sigma_rad: standard deviation of the views' levelling, radians, [0, 0.2]: it moves a view by that angle times the
+            height, each frame anew and once for the whole flight.
         compass_sigma_rad: standard deviation of a trusted compass, radians, [0.001, pi].
         reset_keeps_heading: probability that the odometry frame's heading survives a step of None, [0, 1].
     """
@@ -39,6 +43,7 @@ class OdometrySettings:
     step_sigma_m: float = 0.15
     step_sigma_share: float = 0.01
     max_speed_m_s: float = 25.0
+    attitude_sigma_rad: float = 0.0035
     compass_sigma_rad: float = 0.15
     reset_keeps_heading: float = 0.5
 
@@ -51,6 +56,7 @@ class OdometrySettings:
             step_sigma_m=(0, 100),
             step_sigma_share=(0, 1),
             max_speed_m_s=(0.1, 500),
+            attitude_sigma_rad=(0, 0.2),
             compass_sigma_rad=(0.001, math.pi),
             reset_keeps_heading=(0, 1),
         )
@@ -66,6 +72,11 @@ class RateSettings:
         independent_m2: ground area that carries one independent observation, square metres, [1, 1e5]: mask and map
             differ by whole buildings, so pixels of one building count together.
         llr_min, llr_max: bounds of one frame's log-likelihood ratio, [-50, 0] and [1, 100]: a frame may be wrong as a whole.
+        repeat: weight of a view's evidence per share of new ground in it, [0.1, 100]: views overlap, and what two of them show
+            counts little more than once, else a hovering aircraft would grow sure of a place that only looks alike. 1 would hold if
+            masks of the same ground always had the same errors.
+        least_fit: a registered view counts only when building in view and map overlap this well (Dice: twice the common area over
+            the sum of both), [0, 1]; the first fix needs one such view.
         learn: whether P1 falls and P0 rises when registered frames fit worse than these say; they never get more trusting.
 
     The defaults are not the shares of pixels that one would count (0.87 and 0.015 in the simulator): masks miss whole buildings, and
@@ -78,6 +89,8 @@ class RateSettings:
     independent_m2: float = 150.0
     llr_min: float = -8.0
     llr_max: float = 25.0
+    repeat: float = 3.0
+    least_fit: float = 0.6
     learn: bool = True
 
     def __post_init__(self) -> None:
@@ -88,6 +101,8 @@ class RateSettings:
             independent_m2=(1, 1e5),
             llr_min=(-50, 0),
             llr_max=(1, 100),
+            repeat=(0.1, 100),
+            least_fit=(0, 1),
         )
         if self.false_alarm >= self.hit:
             raise SettingsError(
@@ -118,7 +133,7 @@ class BeliefSettings:
     headings: int = 72
     off_map_start: float = 0.5
     leak_out: float = 1e-3
-    leak_in: float = 1e-2
+    leak_in: float = 2e-2
     heading_leak: float = 0.002
     max_blocks: int = 120_000
     keep: float = 0.05
@@ -157,15 +172,27 @@ class RatioSettings:
             radius is off by half a step at most.
         noise: standard deviation of a ring's ratio that no rate explains, [0.001, 0.5].
         dof: degrees of freedom of the Student likelihood of one ring, [1, 100].
+        independent_m2: as in ``RateSettings``, for the scatter of a ring's ratio, square metres, [1, 1e5].
+        repeat: as in ``RateSettings``, [0.1, 100].
     """
 
     radii: int = 8
     radius_step: float = 0.02
     noise: float = 0.012
     dof: float = 5.0
+    independent_m2: float = 300.0
+    repeat: float = 5.0
 
     def __post_init__(self) -> None:
-        _check(self, radii=(1, 32), radius_step=(0.001, 0.2), noise=(0.001, 0.5), dof=(1, 100))
+        _check(
+            self,
+            radii=(1, 32),
+            radius_step=(0.001, 0.2),
+            noise=(0.001, 0.5),
+            dof=(1, 100),
+            independent_m2=(1, 1e5),
+            repeat=(0.1, 100),
+        )
 
 
 @dataclass(frozen=True, slots=True)

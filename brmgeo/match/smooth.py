@@ -154,7 +154,13 @@ class _Piece:
                 turn += weight * complex(math.cos(angle), math.sin(angle))
         if abs(turn) == 0.0:
             here = [i for i, a in enumerate(anchors) if a is not None]
-            track = np.cumsum([np.zeros(2) if m.step_m is None or i == 0 else m.step_m for i, m in enumerate(self._motions)], axis=0)
+            track = np.cumsum(
+                [
+                    np.zeros(2) if m.step_m is None or i == 0 else m.step_m
+                    for i, m in enumerate(self._motions)
+                ],
+                axis=0,
+            )
             places = np.array([anchors[i].pose[:2] for i in here])  # type: ignore[union-attr]
             a = (track[here] - track[here].mean(axis=0)) @ np.array([1, 1j])
             b = (places - places.mean(axis=0)) @ np.array([1, 1j])

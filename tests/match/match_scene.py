@@ -70,7 +70,15 @@ def town(
         at = rng.uniform(0, size_m, 2)
         for _ in range(rng.integers(5, 25)):
             p = at + rng.normal(0, 60, 2)
-            rects.append([left + p[0], bottom + p[1], rng.uniform(4, 14), rng.uniform(3, 8), angle + rng.normal(0, 0.05)])
+            rects.append(
+                [
+                    left + p[0],
+                    bottom + p[1],
+                    rng.uniform(4, 14),
+                    rng.uniform(3, 8),
+                    angle + rng.normal(0, 0.05),
+                ]
+            )
     return Town(np.array(rects[:count]), left, bottom, size_m)
 
 
@@ -104,7 +112,16 @@ def view_at(
 
 def blank_view(t_s: float = 0.0) -> View:
     """A view without any building."""
-    return View(t_s, np.zeros((118, 158), np.float32), np.ones((118, 158), np.bool_), 1.0, (59.0, 79.0), 150.0, 59.0, "blank.png")
+    return View(
+        t_s,
+        np.zeros((118, 158), np.float32),
+        np.ones((118, 158), np.bool_),
+        1.0,
+        (59.0, 79.0),
+        150.0,
+        59.0,
+        "blank.png",
+    )
 
 
 @dataclass(frozen=True)
@@ -145,7 +162,9 @@ def fly(
     c, s = math.cos(-odometry_yaw), math.sin(-odometry_yaw)
     for i, (p, a) in enumerate(zip(xy, yaw)):
         t = 5.0 * i
-        views.append(blank_view(t) if i in blank else view_at(scene, p[0], p[1], a, t, missed=missed, rng=rng))
+        views.append(
+            blank_view(t) if i in blank else view_at(scene, p[0], p[1], a, t, missed=missed, rng=rng)
+        )
         if i == 0 or not odometry:
             motions.append(Motion(0.0 if i == 0 else 5.0, None, a - odometry_yaw if odometry else None))
         else:

@@ -1,0 +1,249 @@
+"""What must hold for whole flights: metamorphic laws of localization, honest status, recovery."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from match_scene import Flight, Town, blank_view, errors, fly, path, run, town, view_at
+
+from brmgeo.errors import FlightError
+from brmgeo.flight.values import Motion
+from brmgeo.match import BeliefSettings, GroundMap, MatchSettings, PaperSettings, make_matcher
+
+# Coarser than the defaults, so that the whole file takes seconds.
+QUICK = MatchSettings(belief=BeliefSettings(headings=72, cell_m=6.0))
+SCENE = town(21)
+GROUND = SCENE.ground()
+LEGS = [(0.4, 8), (0.4 + math.pi / 2, 7)]
+
+
+def flight(scene: Town = SCENE, start: tuple[float, float] = (1500.0, 5500.0), **options: object) -> Flight:
+    return fly(scene, *path(start, LEGS), **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def plain() -> tuple[Flight, list, object]:
+    f = flight(scale=1.05)
+    matcher = make_matcher("mask", GROUND, QUICK)
+    return f, run(matcher, f), matcher
+
+
+def test_mask_fixes_early_and_keeps_the_track_with_a_scale_bias(plain) -> None:  # type: ignore[no-untyped-def]
+    f, estimates, matcher = plain
+    error = errors(f, estimates)
+    assert np.flatnonzero(np.isfinite(error))[0] <= 6
+    assert np.isfinite(error[8:]).mean() > 0.8
+    assert np.nanmax(error) < 5.0
+    assert 1 / estimates[-1].extra["scale"] == pytest.approx(1.05, abs=0.02)
+    yaw = np.array([e.yaw_rad for e in estimates[-5:]]) - f.yaw[-5:]
+    assert np.abs(np.angle(np.exp(1j * yaw))).max() < 0.05
+    smooth = matcher.smooth()
+    off = np.hypot(*(smooth.xy - f.xy).T)
+    assert off.max() < 4.0
+    assert np.array_equal(smooth.t_s, [v.t_s for v in f.views])
+    assert (smooth.sigma_m < 5).all()
+
+
+def test_shift_the_map_and_the_fix_shifts(plain) -> None:  # type: ignore[no-untyped-def]
+    f, estimates, _ = plain
+    moved = GroundMap(GROUND.building, GROUND.left + 123_456.0, GROUND.top - 7_890.0, GROUND.gsd_m)
+    for a, b in zip(estimates, run(make_matcher("mask", moved, QUICK), f)):
+        assert a.status == b.status
+        np.testing.assert_allclose(b.mean - a.mean, [123_456.0, -7_890.0], atol=0.05)
+        assert b.mass == pytest.approx(a.mass, abs=1e-3)
+
+
+def test_turn_the_view_and_only_the_heading_turns(plain) -> None:  # type: ignore[no-untyped-def]
+    f, estimates, _ = plain
+    turned = []
+    for v, m in zip(f.views, f.motions):
+        # Nose to the left by 90 degrees: what was left is now ahead.
+        h, w = v.building.shape
+        row, col = v.nadir_px
+        turned.append(
+            (
+                replace(
+                    v,
+                    building=np.rot90(v.building, -1).copy(),
+                    known=np.rot90(v.known, -1).copy(),
+                    nadir_px=(col, h - row),
+                ),
+                replace(m, yaw_rad=m.yaw_rad + math.pi / 2),
+            )
+        )
+    matcher = make_matcher("mask", GROUND, QUICK)
+    for (v, m), a in zip(turned, estimates):
+        b = matcher.step(v, m)
+        assert b.status == a.status
+        if a.status == "converged":
+            assert math.hypot(*(b.mean - a.mean)) < 0.3
+            assert abs(np.angle(np.exp(1j * (b.yaw_rad - a.yaw_rad - math.pi / 2)))) < 0.01
+
+
+@pytest.mark.parametrize("method", ["mask", "ratio", "paper"])
+def test_blank_views_never_give_a_position(method: str) -> None:
+    settings = replace(QUICK, paper=PaperSettings(e1=0.2))
+    ground = town(21, 800.0, 250).ground(2.0)
+    matcher = make_matcher(method, ground, settings)
+    for i in range(40):
+        estimate = matcher.step(
+            blank_view(5.0 * i), Motion(5.0 * bool(i), np.array([20.0, 0.0]) if i else None, 0.0, 0.1)
+        )
+        assert estimate.position is None
+    path_after = matcher.smooth()
+    assert np.isnan(path_after.xy).all()
+    assert np.isinf(path_after.sigma_m).all()
+
+
+def test_blank_views_after_a_fix_spread_the_belief() -> None:
+    f = flight(blank=range(8, 16))
+    estimates = run(make_matcher("mask", GROUND, QUICK), f)
+    assert any(e.position for e in estimates[:8])
+    entropy = [e.extra["entropy"] for e in estimates]
+    assert entropy[15] > entropy[7]
+    assert estimates[15].covariance.trace() > estimates[7].covariance.trace()
+    error = errors(f, estimates)
+    assert not (error > 50).any()
+
+
+def test_two_identical_districts_stay_ambiguous() -> None:
+    half = town(31, 700.0, 260)
+    twin = half.rects + [700.0, 0, 0, 0, 0]
+    inside = (half.rects[:, 0] < 1680) & (half.rects[:, 0] > 1020)
+    both = Town(np.concatenate([half.rects[inside], twin[inside]]), 1000.0, 5000.0, 1400.0)
+    xy, yaw = path((1150.0, 5350.0), [(0.0, 12)])
+    f = fly(both, xy, yaw)
+    for estimate in run(make_matcher("mask", both.ground(), QUICK), f):
+        assert estimate.position is None
+        assert estimate.mass < 0.99
+    assert estimate.status == "ambiguous"
+    near = [min(np.hypot(*(estimate.candidates - xy[-1] - [d, 0]).T)) for d in (0.0, 700.0)]
+    assert max(near) < 12.0
+
+
+@pytest.mark.parametrize("method", ["mask", "ratio"])
+def test_wrong_map_ends_lost(method: str) -> None:
+    f = flight(town(99))
+    estimates = run(make_matcher(method, GROUND, QUICK), f)
+    assert all(e.position is None for e in estimates)
+    if method == "mask":
+        assert estimates[-1].status == "lost"
+        assert estimates[-1].extra["off_map"] > 0.9
+
+
+def test_kidnapped_aircraft_is_found_again() -> None:
+    first = flight()
+    xy, yaw = path((2100.0, 6100.0), [(3.0, 14)])
+    second = fly(SCENE, xy, yaw, seed=5)
+    both = Flight(
+        np.concatenate([first.xy, second.xy]),
+        np.concatenate([first.yaw, second.yaw]),
+        first.views + second.views,
+        # The odometry says that nothing happened.
+        [*first.motions, Motion(5.0, np.array([25.0, 0.0]), second.motions[0].yaw_rad), *second.motions[1:]],
+    )
+    estimates = run(make_matcher("mask", GROUND, QUICK), both)
+    error = errors(both, estimates)
+    n = len(first.xy)
+    assert np.isfinite(error[n - 1])
+    assert np.nan_to_num(error[n + 1 :]).max() < 50
+    assert np.isfinite(error[-3:]).any()
+
+
+def test_without_odometry_the_status_is_honest() -> None:
+    f = flight(odometry=False, missed=0.05)
+    estimates = run(make_matcher("mask", GROUND, QUICK), f)
+    error = errors(f, estimates)
+    assert np.nan_to_num(error).max() < 50
+    assert np.isfinite(error).any()
+    assert all(e.status in ("converged", "ambiguous", "lost") for e in estimates)
+
+
+def test_unknown_ground_gives_no_false_fix() -> None:
+    building = GROUND.building.copy()
+    # The flight's surroundings were never mapped.
+    building[700:1300, 300:1100] = 255
+    f = flight()
+    estimates = run(
+        make_matcher("mask", GroundMap(building, GROUND.left, GROUND.top, GROUND.gsd_m), QUICK), f
+    )
+    assert not (np.nan_to_num(errors(f, estimates)) > 50).any()
+
+
+def test_a_compass_shortens_the_search() -> None:
+    f = flight()
+    motions = [replace(m, compass_yaw_rad=float(a)) for m, a in zip(f.motions, f.yaw)]
+    matcher = make_matcher("mask", GROUND, QUICK)
+    for v, m in zip(f.views[:2], motions):
+        with_compass = matcher.step(v, m)
+    plain = make_matcher("mask", GROUND, QUICK)
+    for v, m in zip(f.views[:2], f.motions):
+        without = plain.step(v, m)
+    assert with_compass.mass >= without.mass - 1e-6
+    assert abs(np.angle(np.exp(1j * (with_compass.yaw_rad - f.yaw[1])))) < 0.3
+
+
+def test_ratio_fixes_without_using_the_heading_of_the_view() -> None:
+    f = flight(scale=1.03, missed=0.05)
+    matcher = make_matcher("ratio", GROUND, QUICK)
+    error = errors(f, run(matcher, f))
+    assert np.nan_to_num(error).max() < 50
+    assert np.isfinite(error).any()
+
+
+def test_paper_narrows_the_candidates_to_the_truth() -> None:
+    scene = town(41, 500.0, 140)
+    ground = scene.ground(2.0)
+    xy, yaw = path((1120.0, 5200.0), [(0.3, 10)], step_m=20.0)
+    f = fly(scene, xy, yaw, missed=0.0)
+    settings = MatchSettings(paper=PaperSettings(e1=0.05, eps_m=6.0, d_max_m=20.0))
+    matcher = make_matcher("paper", ground, settings)
+    estimates = run(matcher, f)
+    assert estimates[0].candidate_count > 100
+    fixes = [i for i, e in enumerate(estimates) if e.status == "converged"]
+    assert fixes
+    assert np.nanmax(errors(f, estimates)) < 25
+    assert np.isfinite(matcher.smooth().xy[fixes[0] :]).all()
+
+
+def test_paper_starts_again_when_nothing_is_left() -> None:
+    scene = town(41, 500.0, 140)
+    matcher = make_matcher("paper", scene.ground(2.0), MatchSettings(paper=PaperSettings(e1=0.02, eps_m=1.0)))
+    matcher.step(view_at(scene, 1250, 5250, 0.0), Motion(0.0, None, 0.0))
+    restarted = 0.0
+    for i in range(1, 6):
+        e = matcher.step(
+            view_at(scene, 1250 + 10 * i, 5250, 0.0, 5.0 * i), Motion(5.0, np.array([90.0, 0.0]), 0.0)
+        )
+        restarted += e.extra["restarted"]
+        assert e.candidate_count > 0 or e.status == "lost"
+    assert restarted > 0
+
+
+@pytest.mark.parametrize("method", ["mask", "ratio", "paper"])
+def test_malformed_frames_are_refused(method: str) -> None:
+    matcher = make_matcher(method, GROUND, QUICK)
+    good = view_at(SCENE, 1500, 5500, 0.0)
+    still = Motion(0.0, None, 0.0)
+    for view, motion, words in (
+        (replace(good, agl_m=math.nan), still, "height"),
+        (replace(good, agl_m=0.0), still, "above 0"),
+        (replace(good, known=good.known[:5]), still, "equal"),
+        (replace(good, building=good.building + 2), still, r"\[0, 1\]"),
+        (good, Motion(5.0, np.array([np.nan, 0.0]), 0.0), "finite"),
+        (good, Motion(-1.0, None, 0.0), "backwards"),
+    ):
+        with pytest.raises(FlightError, match=words):
+            matcher.step(view, motion)
+
+
+def test_a_single_frame_and_none_at_all() -> None:
+    for method in ("mask", "ratio", "paper"):
+        matcher = make_matcher(method, GROUND, QUICK)
+        assert matcher.smooth().xy.shape == (0, 2)
+        estimate = matcher.step(view_at(SCENE, 1500, 5500, 0.0), Motion(0.0, None, None))
+        assert estimate.position is None or math.hypot(estimate.mean[0] - 1500, estimate.mean[1] - 5500) < 5
+        assert matcher.smooth().xy.shape == (1, 2)
