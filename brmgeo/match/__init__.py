@@ -1,8 +1,8 @@
 """Matchers: where a view lies on the building map, from the view and the motion since the one before.
 
-``make_matcher`` gives one of three with the same interface: ``step(view, motion) -> Estimate`` live, frame by frame, and
-``smooth() -> SmoothedPath`` at any time after. ``paper`` keeps the paper's candidate sets (eq. 4-7), ``ratio`` a belief weighed by
-ratio features, ``mask`` (the default) a belief weighed by the whole mask.
+``make_matcher`` gives one of three with the same interface: ``step(view, motion) -> Estimate`` live, frame by
+frame, and ``smooth() -> SmoothedPath`` at any time after. ``paper`` keeps the paper's candidate sets (eq.
+4-7), ``ratio`` a belief weighed by ratio features, ``mask`` (the default) a belief weighed by the whole mask.
 """
 
 from __future__ import annotations

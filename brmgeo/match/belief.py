@@ -1,14 +1,14 @@
 """A belief over place and heading that is sparse in space: blocks where it lives, two numbers for all the rest.
 
-The state is a cell of a north-up grid and a heading bin of the odometry frame. Cells are kept in blocks of 16 x 16 of one
-heading; only blocks that hold more than a small share of an even spread are *listed*. Everything else is two numbers:
-``rest``, the mass that lies anywhere on the map outside the listed blocks, spread evenly, and ``off``, the mass of
-"this flight is not over the map, or nothing here can be trusted". So memory and time follow the area that is still
-possible. At the start nothing is listed: the first informative frame lists what fits.
+The state is a cell of a north-up grid and a heading bin of the odometry frame. Cells are kept in blocks of 16
+x 16 of one heading; only blocks that hold more than a small share of an even spread are *listed*. Everything
+else is two numbers: ``rest``, the mass that lies anywhere on the map outside the listed blocks, spread evenly,
+and ``off``, the mass of "this flight is not over the map, or nothing here can be trusted". So memory and time
+follow the area that is still possible. At the start nothing is listed: the first informative frame lists what fits.
 
-Likelihoods are ratios against a background, so ``off`` and, where a frame is scored at listed blocks only, ``rest`` keep their
-mass and everything is normalised afterwards. Prediction moves each heading's blocks by the odometry step turned into that
-heading and blurs them; mass that leaves the grid goes to ``off``.
+Likelihoods are ratios against a background, so ``off`` and, where a frame is scored at listed blocks only,
+``rest`` keep their mass and everything is normalised afterwards. Prediction moves each heading's blocks by the
+odometry step turned into that heading and blurs them; mass that leaves the grid goes to ``off``.
 """
 
 from __future__ import annotations
@@ -174,7 +174,8 @@ def _step_kernels(fraction: F64, sigma: float, reach: int) -> F32:
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """The heaviest place of a belief: cell coordinates (row, col) of mean and covariance, heading of the odometry frame.
+    """The heaviest place of a belief: cell coordinates (row, col) of mean and covariance, heading of the
+    odometry frame.
 
     ``mass`` counts cells within the mode's radius and headings within 30 degrees of the heaviest cell.
     """
@@ -425,7 +426,7 @@ class Belief:
         self.prune()
 
     def update(self, llr: F32, low: float, high: float, weight: float = 1.0) -> float:
-        """Weigh listed blocks by (n, 16, 16) log-likelihood ratios, which are overwritten; returns the log of the evidence."""
+        """Weigh listed blocks by (n, 16, 16) log-likelihood ratios (overwritten); returns the log of the evidence."""
         self.blocks *= _factor(llr, low, high, weight)
         self.blocks[self.blocks < 1e-25] = 0.0
         total = self._normalise()
@@ -513,7 +514,7 @@ class Belief:
         s, i, j = rows[best // BLOCK**2], best // BLOCK % BLOCK, best % BLOCK
         row, col = self.keys[s, 1] * BLOCK + i, self.keys[s, 2] * BLOCK + j
         place, inverse = np.unique(row.astype(np.int64) * self.shape[1] + col, return_inverse=True)
-        mass = np.bincount(inverse, weights=flat[best].astype(np.float64))
+        mass = np.bincount(inverse, weights=flat[best]).astype(np.float64)
         order = np.argsort(mass)[::-1]
         place = place[order]
         centres = np.stack([place // self.shape[1] + 0.5, place % self.shape[1] + 0.5], axis=1)

@@ -1,9 +1,10 @@
 """The filter that ``ratio`` and ``mask`` share: belief on a grid, status, local track, smoother.
 
-One step: move the belief by odometry, weigh it by the view, read off the heaviest place. While mass lies outside the listed
-blocks the view is scored over the whole map, so nothing that still is possible is left out; once the belief is
-concentrated it is scored only where the belief lives. After a fix a local track (place, heading, scale) is carried along
-and corrected by measured poses; the belief goes on alone and remains the judge of whether there is a fix at all.
+One step: move the belief by odometry, weigh it by the view, read off the heaviest place. While mass lies
+outside the listed blocks the view is scored over the whole map, so nothing that still is possible is left out;
+once the belief is concentrated it is scored only where the belief lives. After a fix a local track (place,
+heading, scale) is carried along and corrected by measured poses; the belief goes on alone and remains the
+judge of whether there is a fix at all.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ def check_view(view: View) -> None:
     name = f"frame {view.file!r} at {view.t_s} s"
     if view.building.ndim != 2 or view.building.shape != view.known.shape or view.building.size == 0:
         raise FlightError(
-            f"{name}: mask {view.building.shape} and known {view.known.shape} must be equal and not empty; rebuild the view"
+            f"{name}: mask {view.building.shape} and known {view.known.shape} must be equal "
+            "and not empty; rebuild the view"
         )
     numbers = (view.t_s, view.gsd_m, view.agl_m, view.radius_m, *view.nadir_px)
     if not all(map(math.isfinite, numbers)) or min(view.gsd_m, view.agl_m, view.radius_m) <= 0:
@@ -51,7 +53,8 @@ def check_motion(motion: Motion, view: View) -> None:
     numbers += [v for v in (motion.yaw_rad, motion.compass_yaw_rad) if v is not None]
     if not all(map(math.isfinite, numbers)) or motion.dt_s < 0 or motion.sigma_m < 0:
         raise FlightError(
-            f"frame {view.file!r} at {view.t_s} s: motion {motion} is not finite or runs backwards; correct the odometry"
+            f"frame {view.file!r} at {view.t_s} s: motion {motion} is not finite or runs backwards; "
+            "correct the odometry"
         )
 
 
@@ -106,6 +109,7 @@ class GridMatcher(ABC):
         """Whether a first fix needs a measured pose."""
         return False
 
+    @abstractmethod
     def _learn(self, view: View, anchor: Anchor) -> None:
         """Adapt to a view whose pose is well known."""
 
@@ -189,7 +193,7 @@ class GridMatcher(ABC):
             self._since_informed_m = 0.0
 
     def _novelty(self, view: View, motion: Motion) -> float:
-        """Weight of the view's evidence: by the share of it that the view before did not show; 1 where that is unknown."""
+        """Weight of the view's evidence, by the share of it that the view before did not show; 1 if unknown."""
         if len(self._views) < 2 or motion.step_m is None:
             return 1.0
         area, repeat = self._evidence(view)

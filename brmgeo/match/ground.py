@@ -75,7 +75,9 @@ class GroundMap:
             built[i : i + n] = np.count_nonzero(tiles == 1, axis=(1, 3))
             known[i : i + n] = np.count_nonzero(tiles != UNKNOWN, axis=(1, 3))
         area = np.float32(cell_px * cell_px)
-        return built / area, known / area
+        built /= area
+        known /= area
+        return built, known
 
 
 def disc_pixels(radius_px: float) -> int:

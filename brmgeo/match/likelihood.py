@@ -1,20 +1,22 @@
 """Log-likelihood ratios of a view against a background: of its whole mask, and of its ratio rings.
 
-**Mask.** For a pose, c is the building share of a map cell under a patch of the view, m its known share, k the mask's building
-share and w its known share. A mask pixel is building with P1 over a mapped building and P0 elsewhere; under the
-background, that this view has nothing to do with this place, with the view's own rate pb. Per patch
+**Mask.** For a pose, c is the building share of a map cell under a patch of the view, m its known share, k the
+mask's building share and w its known share. A mask pixel is building with P1 over a mapped building and P0
+elsewhere; under the background, that this view has nothing to do with this place, with the view's own rate pb.
+Per patch
 
     llr = k [c log(P1/pb) + (m-c) log(P0/pb)] + (w-k) [c log((1-P1)/(1-pb)) + (m-c) log((1-P0)/(1-pb))] = c a + m b,
 
-so a heading costs one correlation of the building cover with ``a`` and, where ground is unknown, one of the known cover with
-``b``. Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings, so a patch counts as its
-area over the area that carries one independent observation. pb is kept within [P0, P1]: a blank view then says nothing
-in favour of any place, it only speaks against built-up ones.
+so a heading costs one correlation of the building cover with ``a`` and, where ground is unknown, one of the
+known cover with ``b``. Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings,
+so a patch counts as its area over the area that carries one independent observation. pb is kept within [P0,
+P1]: a blank view then says nothing in favour of any place, it only speaks against built-up ones.
 
-**Rings.** The ratios in n discs (eq. 1-3) are differenced into n rings, whose errors hardly depend on each other. A ring's share
-is expected at P0 + (P1-P0) G and scatters by missed and invented buildings, P(1-P) over the number of independent areas in the
-ring, by the position within a cell, and by a floor; a Student density keeps one odd ring from deciding. The background is
-the map's own distribution: the mean likelihood over all its cells, half and half with an even spread over rings.
+**Rings.** The ratios in n discs (eq. 1-3) are differenced into n rings, whose errors hardly depend on each
+other. A ring's share is expected at P0 + (P1-P0) G and scatters by missed and invented buildings, P(1-P) over
+the number of independent areas in the ring, by the position within a cell, and by a floor; a Student density
+keeps one odd ring from deciding. The background is the map's own distribution: the mean likelihood over all
+its cells, half and half with an even spread over rings.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ class ViewPoints:
 
 
 def view_points(view: View, patch_m: float) -> ViewPoints:
-    """The view's known ground in square patches of about ``patch_m`` (whole pixels, at least one); empty ones left out."""
+    """The view's known ground in square patches of about ``patch_m`` (whole pixels, at least one)."""
     q = max(1, round(patch_m / view.gsd_m))
     h, w = view.known.shape
     n, m = -(-h // q), -(-w // q)
@@ -116,8 +118,8 @@ class Rates:
 class RateLearner:
     """P1 and P0 from registered views: more careful than the settings where the views are worse, never more trusting.
 
-    Counts are kept in independent areas, so that one view weighs about as much as the buildings it shows; the settings count
-    as ``PRIOR`` such areas each, and old views fade.
+    Counts are kept in independent areas, so that one view weighs about as much as the buildings it shows; the
+    settings count as ``PRIOR`` such areas each, and old views fade.
     """
 
     PRIOR = 60.0
@@ -130,7 +132,7 @@ class RateLearner:
         self.rates = Rates(settings.hit, settings.false_alarm, settings.independent_m2)
 
     def learn(self, built_on: float, other_on: float, built_off: float, other_off: float) -> None:
-        """Take in one registered view: square metres of building and other, over mapped buildings (on) and elsewhere (off)."""
+        """Take in one registered view: square metres of building and other, over mapped buildings and elsewhere."""
         if not self._settings.learn:
             return
         unit = self.rates.independent_m2
@@ -164,7 +166,7 @@ def _splat(forward, left, built, known, yaw, wanted, cell, reach, out_k, out_w, 
         for n in range(forward.shape[0]):
             x = (forward[n] * c - left[n] * s) / cell + reach
             y = -(forward[n] * s + left[n] * c) / cell + reach
-            j0, i0 = int(math.floor(x)), int(math.floor(y))
+            j0, i0 = math.floor(x), math.floor(y)
             fx, fy = x - j0, y - i0
             for di in range(2):
                 wy = fy if di else 1.0 - fy
@@ -179,10 +181,11 @@ def _splat(forward, left, built, known, yaw, wanted, cell, reach, out_k, out_w, 
 def mask_templates(
     points: ViewPoints, yaw_rad: F64, cell_m: float, rates: Rates, wanted: NDArray[np.bool_] | None = None
 ) -> tuple[F32, F32]:
-    """Templates a and b of the mask's log-likelihood ratio, for each yaw of the body in the map (zeros where not wanted).
+    """Templates a and b of the mask's log-likelihood ratio, for each yaw of the body in the map (zeros where
+    not wanted).
 
-    Returns two (yaws, 2 R + 1, 2 R + 1) float32: the ratio at a cell is the sum over the template of a times the map's building
-    share and b times its known share, the template's middle on the cell.
+    Returns two (yaws, 2 R + 1, 2 R + 1) float32: the ratio at a cell is the sum over the template of a times
+    the map's building share and b times its known share, the template's middle on the cell.
     """
     reach = math.ceil(points.reach_m / cell_m) + 1
     shape = (len(yaw_rad), 2 * reach + 1, 2 * reach + 1)
@@ -253,9 +256,10 @@ class MapCover:
     def score_all(self, a: F32, b: F32, wanted: NDArray[np.bool_]) -> Iterator[F32 | None]:
         """Ratios at every cell, heading by heading: (rows, cols) float32, or None where ``wanted`` is False.
 
-        By Fourier transforms of tiles of at most 1024 cells, a few headings at a time, so memory does not follow the number of
-        headings. The known cover's part varies slowly: it is summed on cells four times as large and interpolated, which
-        changes the ratio only near the edge of known ground, by a few hundredths of the template's sum at most.
+        By Fourier transforms of tiles of at most 1024 cells, a few headings at a time, so memory does not
+        follow the number of headings. The known cover's part varies slowly: it is summed on cells four times
+        as large and interpolated, which changes the ratio only near the edge of known ground, by a few
+        hundredths of the template's sum at most.
         """
         reach = a.shape[1] // 2
         self._prepare(reach)
@@ -366,7 +370,8 @@ def _score_blocks(built, known, keys, a, b, out, t0, t1):  # type: ignore[no-unt
 
 @dataclass(frozen=True, slots=True)
 class Rings:
-    """Ring shares of a view: (n,) float64 ``share`` in [0, 1] and known area ``area_m2``, and the ``radius_m`` of the discs."""
+    """Ring shares of a view: (n,) float64 ``share`` in [0, 1] and known area ``area_m2``, and the ``radius_m``
+    of the discs."""
 
     share: F64
     area_m2: F64
@@ -376,7 +381,8 @@ class Rings:
 def view_rings(view: View, count: int) -> Rings:
     """Shares of building in ``count`` rings between the radii r_k = k / count of the view's largest disc (eq. 1-3).
 
-    A pixel belongs to a disc when its centre does; unknown pixels count in neither sum. A ring without known pixels has area 0.
+    A pixel belongs to a disc when its centre does; unknown pixels count in neither sum. A ring without known
+    pixels has area 0.
     """
     h, w = view.known.shape
     row = (np.arange(h) + 0.5 - view.nadir_px[0]) * view.gsd_m
@@ -396,7 +402,7 @@ def view_rings(view: View, count: int) -> Rings:
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, out, i0, i1):  # type: ignore[no-untyped-def]
     """log p(rings | cell): (rows, cols) from (n, rows, cols) square metres of building and known in the map's rings."""
-    n, rows, cols = built.shape
+    n, _rows, cols = built.shape
     # lgamma terms make densities of different widths comparable with the even spread of the background.
     const = math.lgamma((dof + 1) / 2) - math.lgamma(dof / 2) - 0.5 * math.log(dof * math.pi)
     for i in range(i0, i1):

@@ -3,9 +3,11 @@
 One step:
 
 - **Search** (eq. 5): every map pixel with sum_k |M_k - f_k| < e1, over the n ratio maps at the frame's own radii.
-- **Heading** (eq. 4): a candidate c of the frame before, that came from b one frame earlier, flew in the direction of c - b.
-- **Motion** (eq. 6): a pixel stays a candidate when it lies in the box of half side eps about (x + d cos theta, y + d sin theta) of
-  some candidate c of the frame before, d being the odometry's distance. While there is only one earlier frame, any theta.
+- **Heading** (eq. 4): a candidate c of the frame before, that came from b one frame earlier, flew in the
+  direction of c - b.
+- **Motion** (eq. 6): a pixel stays a candidate when it lies in the box of half side eps about (x + d cos
+  theta, y + d sin theta) of some candidate c of the frame before, d being the odometry's distance. While there
+  is only one earlier frame, any theta.
 - **Fix** (eq. 7): converged when every candidate lies within d_max of their mean; the mean is the position.
 - When no candidate is left the search starts again from the whole map.
 
@@ -13,13 +15,14 @@ Where the text leaves a choice, this is what is done here:
 
 - The odometry's turn between the two steps is added to theta. The text's straight-line heading would lose every
   candidate at a corner; where the flight goes straight both are the same.
-- The pairs (b, c) behind eq. 4 are followed one by one while that is affordable (``PaperSettings.pair_work`` box tests); with
-  more candidates than that nearly every heading occurs at nearly every candidate, and any heading is allowed. That keeps
-  more candidates, never fewer.
+- The pairs (b, c) behind eq. 4 are followed one by one while that is affordable (``PaperSettings.pair_work``
+  box tests); with more candidates than that nearly every heading occurs at nearly every candidate, and any
+  heading is allowed. That keeps more candidates, never fewer.
 - Candidates are whole pixels; a box contains a pixel when its centre lies strictly inside.
 - A pixel of the map where some ratio is unknown is no candidate, and a frame with a ratio unknown keeps all.
 - The restart takes the frame's own search result as the new first set.
-- A frame without an odometry step lets candidates move by up to the greatest speed in any direction; the pairs start anew.
+- A frame without an odometry step lets candidates move by up to the greatest speed in any direction; the pairs
+  start anew.
 - Ratios are compared on the map's 1e-4 steps. The radii are those of the frame, rounded to the settings' radius step.
 - A position's covariance is the spread of its candidates, and at least that of the box (eps).
 """
@@ -50,7 +53,7 @@ I32 = NDArray[np.int32]
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _search(maps, wanted, limit, counts, out, i0, i1):  # type: ignore[no-untyped-def]
-    n, rows, cols = maps.shape
+    n, _rows, cols = maps.shape
     line = np.empty(cols, np.int32)
     for i in range(i0, i1):
         line[:] = 0
@@ -113,8 +116,8 @@ def _runs(mask, starts, ends, counts, i0, i1):  # type: ignore[no-untyped-def]
 def _keep_reached(starts, ends, counts, spans, reach, out, left, i0, i1):  # type: ignore[no-untyped-def]
     """Clear every pixel of rows [i0, i1) of ``out`` that no run reaches; ``left`` counts what stays in each row.
 
-    A run [s, e) reaches, in the row t below it, the columns [s + a, e - 1 + b) of each span [a, b) of that row offset: one
-    step up and one down in a row of differences, whatever the length.
+    A run [s, e) reaches, in the row t below it, the columns [s + a, e - 1 + b) of each span [a, b) of that row
+    offset: one step up and one down in a row of differences, whatever the length.
     """
     rows, cols = out.shape
     diff = np.zeros(cols + 1, np.int32)
@@ -161,7 +164,8 @@ class RingReach:
         self._left = np.empty(shape[0], np.int64)
 
     def keep(self, mask: U8, spans: NDArray[np.int64], reach: int, out: U8) -> int:
-        """Clear in ``out`` all p without a set q of ``mask`` whose offset p - q lies in the spans; returns what is left.
+        """Clear in ``out`` all p without a set q of ``mask`` whose offset p - q lies in the spans; returns
+        what is left.
 
         ``spans`` is (2 reach + 1, 4) int64 as ``ring_spans`` gives it; row offsets count downwards.
         """
@@ -176,10 +180,11 @@ class RingReach:
 def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple[NDArray[np.int64], int]:
     """Row by row, the whole-pixel offsets that some heading allows: the union of boxes about a circle.
 
-    A pixel offset (dx, dy) belongs when |dx - d cos t| < eps and |dy - d sin t| < eps for some t. With ``inner`` 0 the whole
-    disc of ``distance`` and its boxes belong (used where only the speed bounds the movement).
+    A pixel offset (dx, dy) belongs when |dx - d cos t| < eps and |dy - d sin t| < eps for some t. With
+    ``inner`` 0 the whole disc of ``distance`` and its boxes belong (used where only the speed bounds the movement).
 
-    Returns (2 reach + 1, 4) int64 spans [a, b) and [c, d) per row offset -reach..reach (an empty one has a >= b), and reach.
+    Returns (2 reach + 1, 4) int64 spans [a, b) and [c, d) per row offset -reach..reach (an empty one has a >=
+    b), and reach.
     """
     reach = math.ceil(distance + eps) + 1
     spans = np.zeros((2 * reach + 1, 4), np.int64)
@@ -217,9 +222,7 @@ def _follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distanc
         for a in range(theta_start[p], theta_start[p + 1]):
             x = c + distance * math.cos(theta[a])
             y = r - distance * math.sin(theta[a])
-            for i in range(
-                max(0, int(math.floor(y - eps)) + 1), min(rows - 1, int(math.ceil(y + eps)) - 1) + 1
-            ):
+            for i in range(max(0, math.floor(y - eps) + 1), min(rows - 1, math.ceil(y + eps) - 1) + 1):
                 lo, hi = row_start[i], row_start[i + 1]
                 end = hi
                 # First candidate of the row right of the box's left side.
@@ -248,8 +251,8 @@ def _follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distanc
 class PaperMatcher:
     """Candidate sets; see the module.
 
-    The estimate's mean is the mean of all candidates, whatever the status; ``ambiguous`` while several places are left, ``lost``
-    when a frame fits nowhere on the map.
+    The estimate's mean is the mean of all candidates, whatever the status; ``ambiguous`` while several places
+    are left, ``lost`` when a frame fits nowhere on the map.
     """
 
     def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
@@ -262,7 +265,7 @@ class PaperMatcher:
         self._reach = RingReach(shape)
         self._have = False
         self._count = 0
-        # Pairs behind eq. 4: candidates (m, 2) and the directions in which each arrived, odometry frame of the last step.
+        # Pairs behind eq. 4: candidates (m, 2) and the directions in which each arrived.
         self._places: I32 | None = None
         self._theta_start = np.zeros(1, np.int64)
         self._theta = np.empty(0)
@@ -347,9 +350,10 @@ class PaperMatcher:
 
     def _listed(self) -> tuple[I32, NDArray[np.int64]]:
         """(n, 2) row, col of ``_now`` in row order, and where each row starts."""
+        rows, cols = self.ground.building.shape
         flat = np.flatnonzero(self._now)
-        places = np.stack(np.divmod(flat, self._now.shape[1]), axis=1).astype(np.int32)
-        start = np.searchsorted(places[:, 0], np.arange(self._now.shape[0] + 1)).astype(np.int64)
+        places = np.stack(np.divmod(flat, cols), axis=1).astype(np.int32)
+        start = np.searchsorted(places[:, 0], np.arange(rows + 1)).astype(np.int64)
         return places, start
 
     def _begin_pairs(self, distance: float, eps: float) -> None:
@@ -376,7 +380,9 @@ class PaperMatcher:
 
     def _follow(self, motion: Motion, distance: float, eps: float) -> int:
         """Eq. 4 and 6 pair by pair; -1 when there are too many pairs."""
-        assert self._places is not None and self._last_step is not None and motion.step_m is not None
+        assert self._places is not None
+        assert self._last_step is not None
+        assert motion.step_m is not None
         if len(self._theta) * (2 * eps) > self.settings.paper.pair_work:
             self._places = None
             return -1

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.flight.values import View
+from brmgeo.maps.ratio import disc_counts
 from brmgeo.match.belief import BLOCK
 from brmgeo.match.grid import GridMatcher
-from brmgeo.maps.ratio import disc_counts
 from brmgeo.match.ground import UNKNOWN, GroundMap, RatioCache, disc_pixels
 from brmgeo.match.likelihood import Rates, ring_llr, ring_loglik, view_rings
 from brmgeo.match.settings import MatchSettings
@@ -34,6 +33,9 @@ class RatioMatcher(GridMatcher):
 
     def _bounds(self) -> tuple[float, float]:
         return self.settings.rates.llr_min, self.settings.rates.llr_max
+
+    def _learn(self, view: View, anchor: Anchor) -> None:
+        """Ratios alone do not tell missed buildings from invented ones: nothing is learned."""
 
     def _evidence(self, view: View) -> tuple[float, float]:
         return math.pi * view.radius_m**2, self.settings.ratio.repeat
@@ -61,8 +63,8 @@ class RatioMatcher(GridMatcher):
     def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
         """The rings' likelihood about the pose on a grid of 1 m, as one Gaussian; the heading stays unknown.
 
-        The likelihood may have several peaks. Its product with the pose's own Gaussian has moments; the Gaussian that turns the
-        one into the other is the measurement.
+        The likelihood may have several peaks. Its product with the pose's own Gaussian has moments; the
+        Gaussian that turns the one into the other is the measurement.
         """
         g = self.ground
         prior = covariance[:2, :2]

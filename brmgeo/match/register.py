@@ -1,9 +1,10 @@
 """Sub-cell registration of a view on the full-resolution building map, with its own covariance.
 
-The log-likelihood ratio of the belief is summed at the map's own pixels for small offsets and turns about a guess: first on
-2 m pixels over the whole window, then on the map's own over what is left. The ratio's exponential over all offsets and turns is the
-posterior under an even prior in the window; its moments are the pose and its covariance. The covariance is widened by a
-floor for what the model leaves out (roofs that lean, height, map errors of decimetres).
+The log-likelihood ratio of the belief is summed at the map's own pixels for small offsets and turns about a
+guess: first on 2 m pixels over the whole window, then on the map's own over what is left. The ratio's
+exponential over all offsets and turns is the posterior under an even prior in the window; its moments are the
+pose and its covariance. The covariance is widened by a floor for what the model leaves out (roofs that lean,
+height, map errors of decimetres).
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def _offsets(built, known, all_known, forward, left, a, b, row, col, per_m, yaw,
         acc = np.zeros((size, size), np.float32)
         total = np.float32(0.0)
         for n in range(forward.shape[0]):
-            j = int(math.floor(col + (forward[n] * c - left[n] * s) * per_m))
-            i = int(math.floor(row - (forward[n] * s + left[n] * c) * per_m))
+            j = math.floor(col + (forward[n] * c - left[n] * s) * per_m)
+            i = math.floor(row - (forward[n] * s + left[n] * c) * per_m)
             va, vb = a[n], b[n]
             if i - half < 0 or j - half < 0 or i + half >= rows or j + half >= cols:
                 for di in range(size):

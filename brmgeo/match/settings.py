@@ -31,8 +31,8 @@ class OdometrySettings:
         step_sigma_m: noise of a step per axis that does not depend on its length, metres, [0, 100].
         step_sigma_share: noise of a step per axis as a share of its length, [0, 1].
         max_speed_m_s: bound of the movement where odometry says nothing, metres per second, [0.1, 500].
-        attitude_sigma_rad: standard deviation of the views' levelling, radians, [0, 0.2]: it moves a view by that angle times the
-            height, each frame anew and once for the whole flight.
+        attitude_sigma_rad: standard deviation of the views' levelling, radians, [0, 0.2]: it moves a view by
+            that angle times the height, each frame anew and once for the whole flight.
         compass_sigma_rad: standard deviation of a trusted compass, radians, [0.001, pi].
         reset_keeps_heading: probability that the odometry frame's heading survives a step of None, [0, 1].
     """
@@ -71,17 +71,19 @@ class RateSettings:
         false_alarm: P0, the same elsewhere, (0, hit).
         independent_m2: ground area that carries one independent observation, square metres, [1, 1e5]: mask and map
             differ by whole buildings, so pixels of one building count together.
-        llr_min, llr_max: bounds of one frame's log-likelihood ratio, [-50, 0] and [1, 100]: a frame may be wrong as a whole.
-        repeat: weight of a view's evidence per share of new ground in it, [0.1, 100]: views overlap, and what two of them show
-            counts little more than once, else a hovering aircraft would grow sure of a place that only looks alike. 1 would hold if
-            masks of the same ground always had the same errors.
-        least_fit: a registered view counts only when building in view and map overlap this well (Dice: twice the common area over
-            the sum of both), [0, 1]; the first fix needs one such view.
-        learn: whether P1 falls and P0 rises when registered frames fit worse than these say; they never get more trusting.
+        llr_min, llr_max: bounds of one frame's log-likelihood ratio, [-50, 0] and [1, 100]: a frame may be
+            wrong as a whole.
+        repeat: weight of a view's evidence per share of new ground in it, [0.1, 100]: views overlap, and what
+            two of them show counts little more than once, else a hovering aircraft would grow sure of a place
+            that only looks alike. 1 would hold if masks of the same ground always had the same errors.
+        least_fit: a registered view counts only when building in view and map overlap this well (Dice: twice
+            the common area over the sum of both), [0, 1]; the first fix needs one such view.
+        learn: whether P1 falls and P0 rises when registered frames fit worse than these say; they never get
+            more trusting.
 
-    The defaults are not the shares of pixels that one would count (0.87 and 0.015 in the simulator): masks miss whole buildings, and
-    lower rates with a smaller independent area tell places apart best while a wrong map still gains nothing
-    (docs/matchers.md has the table).
+    The defaults are not the shares of pixels that one would count (0.87 and 0.015 in the simulator): masks
+    miss whole buildings, and lower rates with a smaller independent area tell places apart best while a wrong
+    map still gains nothing (docs/matchers.md has the table).
     """
 
     hit: float = 0.7

@@ -1,17 +1,18 @@
 """The flight's path after the flight: all fixes and all odometry at once, also before the first fix.
 
-Each frame's state is x, y, heading of the odometry frame and log scale (``brmgeo.match.track``). Odometry links neighbours, registered
-poses anchor; the least-squares problem is solved by Gauss-Newton with robust weights on the anchors, and each linear
-problem by forward and backward elimination of its block-tridiagonal normal matrix, which also gives every frame's
-covariance. A step without odometry cuts the chain; a piece without an anchor has no place: its rows are NaN with infinite
-sigma.
+Each frame's state is x, y, heading of the odometry frame and log scale (``brmgeo.match.track``). Odometry
+links neighbours, registered poses anchor; the least-squares problem is solved by Gauss-Newton with robust
+weights on the anchors, and each linear problem by forward and backward elimination of its block-tridiagonal
+normal matrix, which also gives every frame's covariance. A step without odometry cuts the chain; a piece
+without an anchor has no place: its rows are NaN with infinite sigma.
 
-In a second round the frames without an anchor are registered about the smoothed poses: seen from behind, the part before the
-first fix is as well known as the rest.
+In a second round the frames without an anchor are registered about the smoothed poses: seen from behind, the
+part before the first fix is as well known as the rest.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -76,7 +77,7 @@ def smooth_path(
     sigma = np.full(n, np.inf)
     cuts = [0, *(i for i in range(1, n) if motions[i].step_m is None), n]
     anchors = list(anchors)
-    for first, last in zip(cuts[:-1], cuts[1:]):
+    for first, last in itertools.pairwise(cuts):
         span = range(first, last)
         if not any(anchors[i] is not None for i in span):
             continue
@@ -203,7 +204,7 @@ class _Piece:
 
 def _solve_tridiagonal(diag: F64, below: F64, right: F64) -> tuple[F64, F64]:
     """Solution (n, m) of the symmetric block-tridiagonal system and the (n, m, m) diagonal blocks of its inverse."""
-    n, m = right.shape
+    n, _m = right.shape
     pivot_inv = np.empty_like(diag)
     carried = np.empty_like(right)
     for i in range(n):

@@ -61,7 +61,7 @@ def test_turn_the_view_and_only_the_heading_turns(plain) -> None:  # type: ignor
     turned = []
     for v, m in zip(f.views, f.motions):
         # Nose to the left by 90 degrees: what was left is now ahead.
-        h, w = v.building.shape
+        h, _w = v.building.shape
         row, col = v.nadir_px
         turned.append(
             (
