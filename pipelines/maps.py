@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 BLOCK_PX = 2048
 MAX_PIXELS = 200_000**2  # 100 x 100 km at 0.5 m: beyond that a stray outline is likelier than a region
+MAX_RADIUS_PX = 5_000  # a block's halo, and with it memory, grows with the radius
 RASTER_SUFFIXES = (".tif", ".tiff", ".vrt", ".jpg", ".jpeg", ".png", ".jp2", ".img")
 VECTOR_SUFFIXES = (".dxf", ".shp", ".gpkg", ".geojson", ".json", ".parquet", ".fgb")
 Inputs = Mapping[str, Path]
@@ -461,6 +462,12 @@ def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = Fals
     Raises MissingInputError (which files or tiles, where they go, where to get them).
     """
     require_projected_metres(region.crs)
+    widest = max(region.ratio.radii())
+    if widest > MAX_RADIUS_PX * region.gsd_m:
+        raise SettingsError(
+            f"region {region.name}: the largest radius of the ratio maps is {widest:g} m; at most {MAX_RADIUS_PX} px, here "
+            f"{MAX_RADIUS_PX * region.gsd_m:g} m, are possible: give smaller radii or a larger gsd_m"
+        )
     plan = Plan(store, region.name)
     place = region.bounds
     generated: Step | None = None
@@ -554,6 +561,10 @@ def find_sources(region: Region, source_dir: Path) -> list[SourceFile]:
     own = region.footprints
     found: dict[Path, None] = {}
     for pattern in own.paths:
+        if not pattern:
+            raise SettingsError(
+                f"region {region.name}: footprints.paths holds an empty path; name a file or a pattern"
+            )
         anchor = Path(pattern).anchor
         below = (Path(anchor) if anchor else source_dir).glob(pattern[len(anchor) :])
         found |= dict.fromkeys(sorted(p for p in below if not p.name.startswith(".") and p.is_file()))

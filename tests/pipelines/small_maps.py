@@ -104,7 +104,8 @@ class SmallRegion:
 def painted(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 3) colours at EPSG:5181 coordinates: smooth, and different everywhere."""
     return np.stack(
-        [128 + 100 * np.sin(x / 60.0), 128 + 100 * np.sin(y / 75.0), 128 + 80 * np.cos((x + y) / 90.0)], axis=-1
+        [128 + 100 * np.sin(x / 60.0), 128 + 100 * np.sin(y / 75.0), 128 + 80 * np.cos((x + y) / 90.0)],
+        axis=-1,
     )
 
 
@@ -150,7 +151,7 @@ class Answer:
 def brmgeo(capsys: pytest.CaptureFixture[str], *words: object) -> Answer:
     """Runs the command in this process, serially unless told otherwise by SCHEDULER."""
     capsys.readouterr()
-    status = run(lambda: cli([str(w) for w in words], standalone_mode=False))
+    status = run(lambda: cli([str(w) for w in words], prog_name="brmgeo", standalone_mode=False))
     said = capsys.readouterr()
     return Answer(status, said.out, said.err)
 

@@ -59,7 +59,9 @@ def test_a_changed_radius_makes_only_the_ratio_maps_again(
     why = brmgeo(capsys, "why", "small", "ratio", "--data", region.data).out
     assert "ratio is stale" in why
     assert "[40.0, 17.3] -> [40.0, 12.0]" in why
-    assert "ratio gives another result" in brmgeo(capsys, "why", "small", "overview", "--data", region.data).out
+    assert (
+        "ratio gives another result" in brmgeo(capsys, "why", "small", "overview", "--data", region.data).out
+    )
     said = brmgeo(capsys, "maps", "small", "--data", region.data)
     assert "small: made ratio, overview;" in said.err
     assert "buildings: start" not in said.err
@@ -84,7 +86,9 @@ def test_changed_sheets_and_tiles_are_noticed_by_content(
     tile.write_bytes(sorted(region.tiles.rglob("*.png"))[1].read_bytes())
     why = brmgeo(capsys, "why", "small", "imagery", "--data", region.data).out
     assert f"1 changed ({tile.relative_to(region.tiles)})" in why
-    assert "has no stage 'nonsense'" in brmgeo(capsys, "why", "small", "nonsense", "--data", region.data).error
+    assert (
+        "has no stage 'nonsense'" in brmgeo(capsys, "why", "small", "nonsense", "--data", region.data).error
+    )
 
 
 def test_damage_in_the_store_is_found_and_mended(built: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
@@ -164,7 +168,14 @@ def test_runs_killed_at_many_moments_end_alike(
 ) -> None:
     region = built.copied_to(tmp_path / "data", store=False)
     monkeypatch.setenv("SCHEDULER", scheduler)
-    for marker in ("outlines: start", "lattice", "footprints: start", "imagery: start", "buildings: start", "ratio: start"):
+    for marker in (
+        "outlines: start",
+        "lattice",
+        "footprints: start",
+        "imagery: start",
+        "buildings: start",
+        "ratio: start",
+    ):
         killed_at(region, marker, 0.15)
     for after_s in (0.0, 0.5):
         killed_at(region, "overview: start", after_s)

@@ -36,9 +36,9 @@ def mask_by_points(built: SmallRegion, margin_px: int = 0) -> NDArray[np.uint8]:
     shapely.prepare(buildings)
     shapely.prepare(known)
     x, y = pixel_centres(margin_px)
-    return np.where(
-        shapely.contains_xy(known, x, y), shapely.contains_xy(buildings, x, y), 255
-    ).astype(np.uint8)
+    return np.where(shapely.contains_xy(known, x, y), shapely.contains_xy(buildings, x, y), 255).astype(
+        np.uint8
+    )
 
 
 def read(path: Path) -> NDArray[np.uint16]:
@@ -124,9 +124,7 @@ def test_buildings_equal_an_independent_rasterisation(built: SmallRegion) -> Non
     mask, expected = read(built.out / "buildings.tif")[0], mask_by_points(built)
     different = np.argwhere(mask != expected)
     x, y = pixel_centres()
-    outlines = shapely.boundary(
-        shapely.union_all([built.truth, *(sheet_polygon(s, CRS) for s in SHEETS)])
-    )
+    outlines = shapely.boundary(shapely.union_all([built.truth, *(sheet_polygon(s, CRS) for s in SHEETS)]))
     points = shapely.points(x[tuple(different.T)], y[tuple(different.T)])
     near = shapely.union_all([outlines, built.truth.boundary])
     # Only a centre on an outline, to the quarter millimetre of the raster's own steps, may go either way.
