@@ -6,6 +6,7 @@ import math
 from collections import OrderedDict
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,20 +89,20 @@ def disc_pixels(radius_px: float) -> int:
 
 
 class RatioCache:
-    """Counts of building and known pixels in discs about every pixel, or every cell, per step of radius.
+    """Building and known ground in discs about every cell, per step of radius.
 
-    Radii are rounded to a geometric ladder of ``step`` (0.02: 2 %), so a frame's radius is off by at most 1 %. A ratio
-    then changes by about 2 * 1 % of the difference between the disc's rim and its mean, some 1e-3 on real ground,
+    Radii are rounded to a geometric ladder of ``step`` (0.04: 4 %), so a frame's radius is off by at most 2 %. A ratio
+    then changes by about 2 * 2 % of the difference between the disc's rim and its mean, some 1e-3 on real ground,
     against a noise of the features of 2e-2 and more. The least recently used radii are dropped beyond ``keep``.
 
     Args:
         ground: the map.
         step: relative size of a step, > 0.
-        cell_px: counts are kept at the centres of cells of this many pixels; 1 keeps every pixel.
+        cell_px: areas are kept at the centres of cells of this many pixels.
         keep: number of radii kept.
     """
 
-    def __init__(self, ground: GroundMap, step: float, cell_px: int = 1, keep: int = 48) -> None:
+    def __init__(self, ground: GroundMap, step: float, cell_px: int, keep: int = 48) -> None:
         self._ground = ground
         self._step = math.log1p(step)
         self._cell = cell_px
@@ -109,8 +110,7 @@ class RatioCache:
         self._kept: OrderedDict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = OrderedDict()
         building = ground.building
         self._built_mask = building == 1
-        known = building != UNKNOWN
-        self._known_mask = known
+        self._known = ground.coverage(cell_px)[1]
 
     def radius(self, radius_m: float) -> float:
         """The ladder's radius nearest to ``radius_m``, metres."""
@@ -124,10 +124,14 @@ class RatioCache:
             return self._kept[step]
         radius_px = math.exp(step * self._step) / self._ground.gsd_m
         area = np.float32(self._ground.gsd_m**2)
-        pair = (
-            self._sampled(disc_counts(self._built_mask, radius_px, threads=2)) * area,
-            self._sampled(disc_counts(self._known_mask, radius_px, threads=2)) * area,
-        )
+        built = self._sampled(disc_counts(self._built_mask, radius_px, threads=2)) * area
+        # Known ground only divides: its share over the cells in reach is near enough, and exact where all is known.
+        reach = math.ceil(radius_px / self._cell)
+        offset = np.arange(-reach, reach + 1) * self._cell
+        distance = np.hypot(offset[:, None], offset[None, :])
+        disc = np.clip((radius_px - distance) / self._cell + 0.5, 0.0, 1.0).astype(np.float32)
+        known = cv2.filter2D(self._known, cv2.CV_32F, disc / disc.sum(), borderType=cv2.BORDER_CONSTANT)
+        pair = (built, np.maximum(known * np.float32(math.pi * radius_px**2) * area, built))
         self._kept[step] = pair
         while len(self._kept) > self._keep:
             self._kept.popitem(last=False)

@@ -177,6 +177,30 @@ class RingReach:
         return int(left.sum())
 
 
+@nb.njit(cache=True, nogil=True)
+def _census(mask, stride, by_row, by_col, sample):  # type: ignore[no-untyped-def]
+    """Set pixels per row and per column, and every ``stride``-th of them as (row, col); returns how many of these."""
+    by_col[:] = 0
+    seen = 0
+    n = 0
+    for i in range(mask.shape[0]):
+        row = mask[i]
+        total = 0
+        for j in range(row.shape[0]):
+            by_col[j] += row[j]
+            total += row[j]
+        by_row[i] = total
+        if total:
+            for j in range(row.shape[0]):
+                if row[j]:
+                    if seen % stride == 0 and n < sample.shape[0]:
+                        sample[n, 0] = i
+                        sample[n, 1] = j
+                        n += 1
+                    seen += 1
+    return n
+
+
 def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple[NDArray[np.int64], int]:
     """Row by row, the whole-pixel offsets that some heading allows: the union of boxes about a circle.
 
@@ -345,7 +369,7 @@ class PaperMatcher:
                 return kept
         spans, reach = ring_spans(distance, eps)
         kept = self._reach.keep(self._before, spans, reach, self._now)
-        self._begin_pairs(distance, eps)
+        self._begin_pairs(kept, distance, eps)
         return kept
 
     def _listed(self) -> tuple[I32, NDArray[np.int64]]:
@@ -356,11 +380,10 @@ class PaperMatcher:
         start = np.searchsorted(places[:, 0], np.arange(rows + 1)).astype(np.int64)
         return places, start
 
-    def _begin_pairs(self, distance: float, eps: float) -> None:
+    def _begin_pairs(self, count: int, distance: float, eps: float) -> None:
         """Pairs of ``_before`` and ``_now`` under any heading, when they are few enough."""
         self._places = None
-        n, m = int(np.count_nonzero(self._now)), int(np.count_nonzero(self._before))
-        if n == 0 or n * m > self.settings.paper.pair_work:
+        if count == 0 or count * self._count > self.settings.paper.pair_work:
             return
         places, _ = self._listed()
         before = np.stack(np.nonzero(self._before), axis=1)
@@ -433,7 +456,10 @@ class PaperMatcher:
                 0,
                 extra,
             )
-        by_row, by_col = np.count_nonzero(self._before, axis=1), np.count_nonzero(self._before, axis=0)
+        by_row, by_col = np.empty(rows, np.int32), np.empty(cols, np.int32)
+        most = self.settings.belief.candidates
+        sample = np.empty((most, 2), np.int32)
+        taken = _census(self._before, -(-self._count // most), by_row, by_col, sample)
         y = self.ground.top - (np.arange(rows) + 0.5) * g
         x = self.ground.left + (np.arange(cols) + 0.5) * g
         mean = np.array([by_col @ x, by_row @ y]) / self._count
@@ -443,17 +469,12 @@ class PaperMatcher:
         half = max(
             abs(y[r[0]] - mean[1]), abs(y[r[-1]] - mean[1]), abs(x[c[0]] - mean[0]), abs(x[c[-1]] - mean[0])
         )
-        flat = np.flatnonzero(self._before)
         status: Status = "ambiguous"
         if half <= s.d_max_m:
-            i, j = np.divmod(flat, cols)
+            i, j = np.nonzero(self._before)
             if float(np.hypot(x[j] - mean[0], y[i] - mean[1]).max()) <= s.d_max_m:
                 status = "converged"
-        most = self.settings.belief.candidates
-        if len(flat) > most:
-            flat = flat[np.linspace(0, len(flat) - 1, most).astype(np.int64)]
-        i, j = np.divmod(flat, cols)
-        candidates = np.stack([x[j], y[i]], axis=1)
+        candidates = np.stack([x[sample[:taken, 1]], y[sample[:taken, 0]]], axis=1)
         cov = np.diag(np.maximum(var, s.eps_m**2 / 3.0))
         heading, heading_sigma = self._heading(motion)
         anchor = None

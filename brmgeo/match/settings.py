@@ -179,7 +179,7 @@ class RatioSettings:
     """
 
     radii: int = 8
-    radius_step: float = 0.02
+    radius_step: float = 0.04
     noise: float = 0.012
     dof: float = 5.0
     independent_m2: float = 300.0

@@ -221,13 +221,15 @@ def test_ratio_cache_equals_counting_and_its_step_is_harmless() -> None:
     built, known = cache.at_cells(47.0)
     i, j = 21, 55
     y, x = np.mgrid[0:800, 0:800] + 0.5
-    for counts, mask in ((built, ground.building == 1), (known, ground.building != 255)):
-        four = [
-            ((x - cx) ** 2 + (y - cy) ** 2 <= (radius / 0.5) ** 2)[mask].sum()
-            for cx in (j * 10 + 4.5, j * 10 + 5.5)
-            for cy in (i * 10 + 4.5, i * 10 + 5.5)
-        ]
-        assert counts[i, j] == pytest.approx(np.mean(four) * 0.25)
+    four = [
+        ((x - cx) ** 2 + (y - cy) ** 2 <= (radius / 0.5) ** 2)[ground.building == 1].sum()
+        for cx in (j * 10 + 4.5, j * 10 + 5.5)
+        for cy in (i * 10 + 4.5, i * 10 + 5.5)
+    ]
+    assert built[i, j] == pytest.approx(np.mean(four) * 0.25)
+    assert known[i, j] == pytest.approx(math.pi * radius**2, rel=1e-4)
+    half = ((x - 5.0) ** 2 + (y - 405.0) ** 2 <= (radius / 0.5) ** 2).sum() * 0.25
+    assert known[40, 0] == pytest.approx(half, rel=0.03)
     # One step of radius, twice the largest rounding, changes ratios by far less than their noise.
     other_built, other_known = cache.at_cells(47.0 * 1.02)
     change = built / known - other_built / other_known
