@@ -35,7 +35,7 @@ _KEYS: dict[str, dict[str, type]] = {
     | dict.fromkeys(("fov_deg", "fx", "fy", "cx", "cy"), float),
     "mount": {"roll_deg": float, "pitch_deg": float, "yaw_deg": float},
     "frames": {"video": str, "start_s": float},
-    "odometry": {"file": str, "format": str, "quaternion": str},
+    "odometry": {"file": str, "format": str, "quaternion": str, "topic": str},
     "height": {"source": str, "fixed_m": float},
     "altimeter": {"file": str, "datum": str, "ground_m": float},
     "reference": {"file": str, "crs": str},
@@ -155,7 +155,7 @@ class Flight:
         if self._reference is None:
             return None
         path, stated = self._reference
-        table = read_table(path, [("t_s", "lon", "lat"), ("t_s", "x", "y")], ["alt_m"])
+        table = read_table(path, [("t_s", "lon", "lat"), ("t_s", "x", "y")], ["alt_m", "sigma_m"])
         table.check_times()
         geographic = "lon" in table.numbers
         names = ("lon", "lat") if geographic else ("x", "y")
@@ -188,7 +188,7 @@ class Flight:
                 path, table.lines[int(lost[0])], names[0], f"the point has no place in {crs_name(crs)}"
             )
         _check_overlap(path, "reference", table.numbers["t_s"], self.times_s)
-        return Reference(table.numbers["t_s"], xy, table.numbers.get("alt_m"))
+        return Reference(table.numbers["t_s"], xy, table.numbers.get("alt_m"), table.numbers.get("sigma_m"))
 
     def _video_image(self, frame: Frame) -> NDArray[np.uint8]:
         # Frames are counted by decoding: seeking lands on key frames in many files.
@@ -574,9 +574,10 @@ def _odometry(
     order = toml.section("odometry").get("quaternion")
     if order not in (None, "xyzw", "wxyz"):
         raise toml.refuse("odometry", "quaternion", f"quaternion is {order!r}: it must be 'xyzw' or 'wxyz'")
+    topic = toml.text("odometry", "topic") if toml.has("odometry", "topic") else None
     body = mount.body_from_camera()
     level = Attitude(frames[0].roll_rad, frames[0].pitch_rad).matrix() @ body
-    odometry = read_odometry(path, format_name, OdometryOptions(order, times, level, body))
+    odometry = read_odometry(path, format_name, OdometryOptions(order, times, level, body, topic))
     _check_overlap(path, "odometry", odometry.t_s, times)
     _, x, y, _ = odometry.wxyz.T
     tilt = float(np.median(np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))))

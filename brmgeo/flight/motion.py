@@ -42,7 +42,7 @@ def breaks(odometry: Odometry, max_gap_s: float, max_speed_m_s: float) -> tuple[
     """(k,) start and (k,) end times of the pieces of a track that no motion may be taken across.
 
     A gap is longer than ``max_gap_s`` and than four times the track's median interval (a track of one pose a frame
-    is whole); a reset is a jump that would need more than ``max_speed_m_s``.
+    is whole); a reset is a jump that would need more than ``max_speed_m_s``, or a change of ``odometry.segment``.
     """
     dt = np.diff(odometry.t_s)
     if not dt.size:
@@ -52,6 +52,8 @@ def breaks(odometry: Odometry, max_gap_s: float, max_speed_m_s: float) -> tuple[
     # A metre of slack: at hundreds of poses a second ordinary noise is a high speed.
     reset = jump_m > max_speed_m_s * dt + 1.0
     broken = gap | reset
+    if odometry.segment is not None:
+        broken |= np.diff(odometry.segment) != 0
     return odometry.t_s[:-1][broken], odometry.t_s[1:][broken]
 
 

@@ -1,4 +1,4 @@
-"""Odometry files in: TUM, EuRoC, KITTI, VINS-Mono CSV and plain CSV, to one value.
+"""Odometry files in: TUM, EuRoC, KITTI, VINS-Mono and VINS-Fusion CSV and plain CSV, to one value.
 
 Each format is one reader in ``READERS``; another format is added by ``register``. What comes out is the pose of the
 body (FLU) in a gravity-aligned frame, z up; see ``brmgeo.flight.readings.Odometry``.
@@ -7,18 +7,20 @@ body (FLU) in a gravity-aligned frame, z up; see ``brmgeo.flight.readings.Odomet
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from brmgeo.errors import FlightError
+from brmgeo.flight.frames import QuaternionOrder, likely_order, quaternion_from_matrix
 from brmgeo.flight.readings import BODY_FROM_NADIR_CAMERA, FloatArray, Odometry
-from brmgeo.flight.tables import check_increasing, nearest, number, read_rows, read_table, refuse
+from brmgeo.flight.tables import check_increasing, nearest, number, read_rows, read_table, read_text, refuse
 
-QuaternionOrder = Literal["xyzw", "wxyz"]
 UNIT_TOLERANCE = 0.01
+#: Rows that repeat a time are one pose told again when they lie no farther apart than this.
+REPEAT_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +33,20 @@ class OdometryOptions:
         level_from_camera: (3, 3) rotation from the optical frame to the level frame at the first frame, for
             formats in the camera's frame.
         body_from_camera: (3, 3) the camera's mount, for the same.
+        topic: which of several, for logs that hold more than one odometry.
     """
 
     quaternion: QuaternionOrder | None = None
     frame_times_s: FloatArray | None = None
     level_from_camera: FloatArray = field(default_factory=lambda: BODY_FROM_NADIR_CAMERA)
     body_from_camera: FloatArray = field(default_factory=lambda: BODY_FROM_NADIR_CAMERA)
+    topic: str | None = None
 
 
 Reader = Callable[[Path, OdometryOptions], Odometry]
 READERS: dict[str, Reader] = {}
-#: Formats of FLIGHT.md whose readers are not in this version.
-PLANNED = ("rosbag", "ulog", "ardupilot")
+#: Formats whose readers are in ``brmgeo.flight.logs``, with their libraries: looked up when first asked for.
+LOG_FORMATS = ("rosbag", "ulog", "ardupilot")
 
 
 def register(name: str, reader: Reader) -> None:
@@ -55,19 +59,19 @@ def read_odometry(path: Path, format_name: str, options: OdometryOptions | None 
 
     Args:
         path: the file.
-        format_name: ``tum``, ``euroc``, ``kitti``, ``vins-mono`` or ``csv``, or what ``register`` added.
+        format_name: ``tum``, ``euroc``, ``kitti``, ``vins-mono``, ``vins-fusion``, ``csv``, ``rosbag``, ``ulog`` or
+            ``ardupilot``, or what ``register`` added.
 
     Raises FlightError, with line and column, for an unknown format, rows that are not of the format, times that do
-    not increase, numbers that are not finite, and quaternions whose length is not 1 within ``UNIT_TOLERANCE``.
+    not increase, numbers that are not finite, quaternions whose length is not 1 within ``UNIT_TOLERANCE``, and
+    quaternions that are plainly in the other order than the format's, unless ``options.quaternion`` states it.
     """
+    if format_name in LOG_FORMATS and format_name not in READERS:
+        import_module("brmgeo.flight.logs")  # registers them
     if format_name not in READERS:
-        formats = ", ".join(READERS)
-        if format_name in PLANNED:
-            raise FlightError(
-                f"{path}: odometry format {format_name!r} is not read by this version: convert it to one of {formats}"
-            )
+        known = list(dict.fromkeys([*READERS, *LOG_FORMATS]))
         raise FlightError(
-            f"{path}: odometry format {format_name!r} is unknown: {nearest(format_name, [*READERS, *PLANNED])}"
+            f"{path}: odometry format {format_name!r} is unknown: {nearest(format_name, known)}"
         )
     return READERS[format_name](path, options or OdometryOptions())
 
@@ -75,6 +79,20 @@ def read_odometry(path: Path, format_name: str, options: OdometryOptions | None 
 def _finish(
     path: Path, t: FloatArray, xyz: FloatArray, wxyz: FloatArray, lines: list[int], columns: str
 ) -> Odometry:
+    # Some writers tell a pose again when they have corrected it (V102 of EuRoC's VINS): the later word counts.
+    repeats = np.flatnonzero(np.diff(t) == 0.0)
+    for i in repeats:
+        apart = float(np.linalg.norm(xyz[i + 1] - xyz[i]))
+        if apart > REPEAT_M:
+            raise refuse(
+                path,
+                lines[i + 1],
+                columns.split()[0],
+                f"time {t[i]:.6f} s is there twice, {apart:.2f} m apart: rows must be in order of time, each once",
+            )
+    if repeats.size:
+        keep = np.setdiff1d(np.arange(len(t)), repeats)
+        t, xyz, wxyz, lines = t[keep], xyz[keep], wxyz[keep], [lines[i] for i in keep]
     check_increasing(path, t, lines, columns.split()[0])
     length = np.linalg.norm(wxyz, axis=1)
     bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
@@ -89,25 +107,51 @@ def _finish(
     return Odometry(t, xyz, wxyz / length[:, None], path.name)
 
 
-def _text_reader(separator: str | None, widths: range, nanoseconds: bool, order: QuaternionOrder) -> Reader:
+def _seconds(path: Path, line: int, text: str, nanoseconds: bool | None) -> float:
+    # None: whole numbers are nanoseconds, as VINS writes them, unless so small that they are seconds; forks write seconds.
+    text = text.strip()
+    whole = text.lstrip("+-").isdigit()
+    if nanoseconds and not whole:
+        raise refuse(path, line, 1, f"time {text[:40]!r} is not a whole number of nanoseconds")
+    if whole and (nanoseconds or (nanoseconds is None and abs(int(text)) >= 1e11)):
+        return int(text) / 1e9
+    seconds = number(path, line, 1, text)
+    return seconds / 1e9 if nanoseconds is None and abs(seconds) >= 1e17 else seconds
+
+
+def _text_reader(
+    separator: str | None,
+    widths: range,
+    nanoseconds: bool | None,
+    order: QuaternionOrder,
+    dialects: bool = False,
+) -> Reader:
     def read(path: Path, options: OdometryOptions) -> Odometry:
-        cells, lines = read_rows(path, separator, widths)
+        between = separator
+        if dialects:
+            rows = (line for line in read_text(path).splitlines() if line.strip() and line.strip()[0] != "#")
+            between = "," if "," in next(rows, ",") else None
+        cells, lines = read_rows(path, between, widths)
         t = np.empty(len(cells))
         values = np.empty((len(cells), 7))
         for i, (row, line) in enumerate(zip(cells, lines)):
-            if nanoseconds:
-                stamp = row[0].strip()
-                if not stamp.lstrip("+-").isdigit():
-                    raise refuse(path, line, 1, f"time {stamp[:40]!r} is not a whole number of nanoseconds")
-                t[i] = int(stamp) / 1e9
-            else:
-                t[i] = number(path, line, 1, row[0])
+            t[i] = _seconds(path, line, row[0], nanoseconds)
             for k in range(7):
                 values[i, k] = number(path, line, k + 2, row[k + 1])
         wxyz = values[:, 3:]
         if (options.quaternion or order) == "xyzw":
             wxyz = wxyz[:, [3, 0, 1, 2]]
-        return _finish(path, t, values[:, :3], wxyz, lines, "1 5-8")
+        found = _finish(path, t, values[:, :3], wxyz, lines, "1 5-8")
+        likely = likely_order(values[:, 3:])
+        if options.quaternion is None and likely not in (None, order):
+            raise refuse(
+                path,
+                lines[0],
+                "5-8",
+                f"read as {order} the aircraft would tumble; the columns look like {likely}: give quaternion = "
+                f'"{likely}" (or "{order}" if they are right) in [odometry] or as --quaternion',
+            )
+        return found
 
     return read
 
@@ -120,8 +164,8 @@ def _read_csv(path: Path, options: OdometryOptions) -> Odometry:
             None,
             "quaternion order is given, but this format names its columns: remove 'quaternion'",
         )
-    table = read_table(path, [("t_s", "x", "y", "z", "qw", "qx", "qy", "qz")])
-    return _finish(
+    table = read_table(path, [("t_s", "x", "y", "z", "qw", "qx", "qy", "qz")], ["segment"])
+    found = _finish(
         path,
         table.numbers["t_s"],
         table.stack("x", "y", "z"),
@@ -129,6 +173,10 @@ def _read_csv(path: Path, options: OdometryOptions) -> Odometry:
         table.lines,
         "t_s qw,qx,qy,qz",
     )
+    if "segment" not in table.numbers:
+        return found
+    kept = np.append(np.diff(table.numbers["t_s"]) != 0.0, True)
+    return replace(found, segment=table.numbers["segment"][kept].astype(np.int64))
 
 
 def _read_kitti(path: Path, options: OdometryOptions) -> Odometry:
@@ -162,32 +210,18 @@ def _read_kitti(path: Path, options: OdometryOptions) -> Odometry:
     level = options.level_from_camera
     body = level @ rotation @ options.body_from_camera.T
     return _finish(
-        path, np.asarray(times, dtype=np.float64), poses[:, :, 3] @ level.T, _wxyz(body), lines, "1 1-12"
+        path,
+        np.asarray(times, dtype=np.float64),
+        poses[:, :, 3] @ level.T,
+        quaternion_from_matrix(body),
+        lines,
+        "1 1-12",
     )
-
-
-def _wxyz(rotation: FloatArray) -> FloatArray:
-    # (n, 4) unit quaternions, by the largest component (Shepperd, 1978), so that no half turn divides by zero.
-    m = rotation
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    squares = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=-1)
-    out = np.empty((len(m), 4))
-    for i, largest in enumerate(squares.argmax(axis=1)):
-        r = m[i]
-        if largest == 0:
-            q = [1 + trace[i], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-        elif largest == 1:
-            q = [r[2, 1] - r[1, 2], 1 + 2 * r[0, 0] - trace[i], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]
-        elif largest == 2:
-            q = [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 + 2 * r[1, 1] - trace[i], r[1, 2] + r[2, 1]]
-        else:
-            q = [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 + 2 * r[2, 2] - trace[i]]
-        out[i] = q
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
 register("tum", _text_reader(None, range(8, 9), False, "xyzw"))
 register("euroc", _text_reader(",", range(8, 30), True, "wxyz"))
 register("kitti", _read_kitti)
-register("vins-mono", _text_reader(",", range(8, 12), True, "wxyz"))
+register("vins-mono", _text_reader(",", range(8, 12), None, "wxyz", dialects=True))
+register("vins-fusion", _text_reader(",", range(8, 12), None, "wxyz", dialects=True))
 register("csv", _read_csv)

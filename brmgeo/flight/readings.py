@@ -104,12 +104,15 @@ class Odometry:
         xyz_m: (n, 3) float64.
         wxyz: (n, 4) float64 unit quaternions, odometry_from_body.
         source: the file's name, for messages and results.
+        segment: (n,) int64 that grows wherever the source says it was reset: no motion is taken across. None: nothing
+            is said.
     """
 
     t_s: FloatArray
     xyz_m: FloatArray
     wxyz: FloatArray
     source: str = ""
+    segment: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +126,15 @@ class Imu:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Where the aircraft really was, in the map's CRS: (n,) seconds, (n, 2) metres, (n,) metres or None."""
+    """Where the aircraft really was, in the map's CRS: (n,) seconds, (n, 2) metres, (n,) metres or None.
+
+    ``sigma_m`` is the receiver's own horizontal accuracy, (n,) metres, or None when nothing is said.
+    """
 
     t_s: FloatArray
     xy_m: FloatArray
     alt_m: FloatArray | None = None
+    sigma_m: FloatArray | None = None
 
     def at(self, times_s: FloatArray, max_gap_s: float = 30.0) -> FloatArray:
         """(m, 2) float64 positions at ``times_s``, linear in between; NaN outside and in gaps over ``max_gap_s``."""

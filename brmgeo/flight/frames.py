@@ -1,0 +1,156 @@
+"""Turning between the frames that logs are written in and ours: the one place where an axis changes its sign.
+
+Ours are ENU (x east, y north, z up) for the world and FLU (x nose, y left, z up) for the body, REP-103. PX4 and
+ArduPilot write NED and FRD. A quaternion is (w, x, y, z), unit length, and named destination_from_source; its sign
+is of no meaning. Quaternion algebra after Kuipers, "Quaternions and Rotation Sequences" (1999).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from brmgeo.flight.readings import FloatArray
+
+QuaternionOrder = Literal["xyzw", "wxyz"]
+
+#: (w, x, y, z) of the half turn about x that takes FRD to FLU (and back), and of the one that takes NED to ENU.
+FLU_FROM_FRD: FloatArray = np.array([0.0, 1.0, 0.0, 0.0])
+ENU_FROM_NED: FloatArray = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+
+#: Below this wander of the vertical (mean length of 1 minus), the order of a quaternion cannot be told from it.
+MIN_WANDER = 0.02
+#: The better order must wander less than this share of the other.
+CLEAR_SHARE = 0.67
+#: No vehicle flies like this on average.
+UPSIDE_DOWN_DEG = 150.0
+
+
+def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(..., 4) the product: ``second`` is applied first, as with matrices. Shapes broadcast."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(first, dtype=np.float64), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(second, dtype=np.float64), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def inverse(wxyz: FloatArray) -> FloatArray:
+    """(..., 4) the turn back, of unit quaternions."""
+    return np.asarray(wxyz, dtype=np.float64) * [1.0, -1.0, -1.0, -1.0]
+
+
+def rotate(wxyz: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(..., 3) ``vectors`` turned by unit quaternions; shapes broadcast."""
+    q, v = np.asarray(wxyz, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
+    twice = 2.0 * np.cross(q[..., 1:], v)
+    return np.asarray(v + q[..., :1] * twice + np.cross(q[..., 1:], twice))
+
+
+def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
+    """(n, 4) unit quaternions of (n, 3, 3) rotations, by the largest component (Shepperd, 1978)."""
+    m = np.asarray(rotation, dtype=np.float64)
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    squares = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=-1)
+    out = np.empty((len(m), 4))
+    for i, largest in enumerate(squares.argmax(axis=1)):
+        r = m[i]
+        if largest == 0:
+            q = [1 + trace[i], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
+        elif largest == 1:
+            q = [r[2, 1] - r[1, 2], 1 + 2 * r[0, 0] - trace[i], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]
+        elif largest == 2:
+            q = [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 + 2 * r[1, 1] - trace[i], r[1, 2] + r[2, 1]]
+        else:
+            q = [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 + 2 * r[2, 2] - trace[i]]
+        out[i] = q
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+def quaternion_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:
+    """(..., 4) quaternion of Rz(yaw) Ry(pitch) Rx(roll): intrinsic yaw-pitch-roll, in FLU and in FRD alike."""
+    r, p, y = (np.asarray(a, dtype=np.float64) / 2.0 for a in (roll_rad, pitch_rad, yaw_rad))
+    zero = np.zeros(np.broadcast_shapes(r.shape, p.shape, y.shape))
+    about_z = np.stack([np.cos(y) + zero, zero, zero, np.sin(y) + zero], axis=-1)
+    about_y = np.stack([np.cos(p) + zero, zero, np.sin(p) + zero, zero], axis=-1)
+    about_x = np.stack([np.cos(r) + zero, np.sin(r) + zero, zero, zero], axis=-1)
+    return multiply(multiply(about_z, about_y), about_x)
+
+
+def euler_from_quaternion(wxyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(...,) roll, pitch and yaw in radians: the inverse of ``quaternion_from_euler`` for pitch within a quarter turn."""
+    w, x, y, z = np.moveaxis(np.asarray(wxyz, dtype=np.float64), -1, 0)
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return roll, pitch, yaw
+
+
+def enu_from_ned(vectors: FloatArray) -> FloatArray:
+    """(..., 3) east, north, up of (..., 3) north, east, down."""
+    return np.asarray(vectors, dtype=np.float64)[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
+def flu_from_frd(vectors: FloatArray) -> FloatArray:
+    """(..., 3) in FLU of (..., 3) in FRD: body vectors, or a z-down world whose heading is arbitrary."""
+    return np.asarray(vectors, dtype=np.float64) * [1.0, -1.0, -1.0]
+
+
+def enu_flu_from_ned_frd(wxyz: FloatArray) -> FloatArray:
+    """(..., 4) enu_from_flu of (..., 4) ned_from_frd: the attitude as our frames tell it."""
+    return multiply(multiply(ENU_FROM_NED, wxyz), FLU_FROM_FRD)
+
+
+def flu_flu_from_frd_frd(wxyz: FloatArray) -> FloatArray:
+    """(..., 4) attitude in a z-up world of one in a z-down world of arbitrary heading (PX4's FRD pose frame)."""
+    return multiply(multiply(FLU_FROM_FRD, wxyz), FLU_FROM_FRD)
+
+
+def flu_from_optical(vectors: FloatArray) -> FloatArray:
+    """(..., 3) x ahead, y left, z up of (..., 3) x right, y down, z ahead: a track told in a level camera's axes."""
+    return np.asarray(vectors, dtype=np.float64)[..., [2, 0, 1]] * [1.0, -1.0, -1.0]
+
+
+def flu_flu_from_optical(wxyz: FloatArray) -> FloatArray:
+    """(..., 4) attitude of one whose world and body are both told in the axes of a level camera that looks ahead."""
+    turn = np.array([0.5, -0.5, 0.5, -0.5])
+    return multiply(multiply(turn, wxyz), inverse(turn))
+
+
+def heading_deg(wxyz: FloatArray) -> FloatArray:
+    """(...,) heading of the nose of enu_from_flu attitudes, degrees clockwise from north, in [0, 360)."""
+    yaw = euler_from_quaternion(wxyz)[2]
+    return np.asarray((90.0 - np.degrees(yaw)) % 360.0)
+
+
+def up_in_body(wxyz: FloatArray) -> FloatArray:
+    """(3,) mean of the world's up in the body's axes; its length is 1 where the body never leans over differently."""
+    return np.asarray(rotate(inverse(wxyz), np.array([0.0, 0.0, 1.0])).mean(axis=0))
+
+
+def likely_order(values: FloatArray) -> QuaternionOrder | None:
+    """The order that (n, 4) quaternion columns are likely in, or None where it cannot be told.
+
+    A vehicle turns about the vertical far more than it leans: read rightly, the world's up stays put in the body
+    while the heading wanders, read wrongly it wanders too. Where nothing wanders, an upside-down vehicle is unlikely.
+    """
+    columns = np.asarray(values, dtype=np.float64)
+    up = {"wxyz": up_in_body(columns), "xyzw": up_in_body(columns[:, [3, 0, 1, 2]])}
+    wander = {order: 1.0 - float(np.linalg.norm(mean)) for order, mean in up.items()}
+    tilt = {order: float(np.degrees(np.arctan2(np.hypot(m[0], m[1]), m[2]))) for order, m in up.items()}
+    orders: tuple[QuaternionOrder, QuaternionOrder] = ("wxyz", "xyzw")
+    for order, other in (orders, orders[::-1]):
+        if wander[other] > MIN_WANDER and wander[order] < CLEAR_SHARE * wander[other]:
+            return order
+    if max(wander.values()) < 0.5:
+        for order, other in (orders, orders[::-1]):
+            if tilt[other] > UPSIDE_DOWN_DEG >= tilt[order]:
+                return order
+    return None

@@ -1,0 +1,295 @@
+"""PX4 logs in (ULog), through pyulog (BSD-3-Clause).
+
+PX4 writes body FRD in NED, or in a z-down world of arbitrary heading (its FRD pose frame), microseconds since boot;
+message definitions after the PX4 user guide, "uORB Message Reference" (vehicle_odometry, vehicle_local_position,
+vehicle_attitude, distance_sensor), with the enums of versions before 1.14 besides the present ones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.flight.frames import (
+    enu_flu_from_ned_frd,
+    enu_from_ned,
+    flu_flu_from_frd_frd,
+    flu_from_frd,
+)
+from brmgeo.flight.logs.values import (
+    Gnss,
+    Height,
+    Log,
+    LogOptions,
+    Orientation,
+    choose,
+    missing_library,
+    unit,
+)
+from brmgeo.flight.readings import FloatArray, Imu, Odometry
+
+Data = dict[str, Any]
+#: In order of worth to a flight without GNSS: what vision said comes before what the autopilot made of everything.
+_STREAMS = ("vehicle_visual_odometry", "vehicle_odometry", "vehicle_local_position")
+_DOWN = 25  # ROTATION_PITCH_270 of distance_sensor.orientation
+
+
+def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
+    """The streams of a PX4 log that a flight needs.
+
+    Raises FlightError for files that are no ULog or break off before the first data, and an odometry asked for that
+    is not there; MissingInputError without the package pyulog. Dropouts and resets are told in the result.
+    """
+    options = options or LogOptions()
+    try:
+        from pyulog import ULog
+    except ImportError:
+        raise missing_library(path, "PX4 logs", "pyulog") from None
+    if not path.is_file():
+        raise MissingInputError(f"{path}: the log is missing")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said):  # the library reports damage by printing
+            log = ULog(str(path))
+    except Exception as error:  # damaged bytes make the library raise nearly anything
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise FlightError(
+            f"{path}: no readable ULog ({reason}): download it from the vehicle again"
+        ) from None
+    sets: dict[str, Data] = {}
+    for each in sorted(log.data_list, key=lambda d: d.multi_id):
+        sets.setdefault(each.name, each.data)
+    if not sets:
+        raise FlightError(
+            f"{path}: the ULog breaks off before its first data: download it from the vehicle again"
+        )
+    notes: list[str] = []
+    if log.file_corruption or "corrupt" in said.getvalue().lower():
+        notes.append("the file is damaged or cut short; what was whole in it was read")
+
+    found = {name: len(sets[name]["timestamp"]) for name in _STREAMS if name in sets and _usable(name, sets)}
+    # Several are the rule, and they are one estimator's words: the first in order of worth is the choice.
+    stream = choose(path, "odometry", "--topic", options.topic, found, any_topic=True)
+    odometry, resets = None, []
+    faults = []
+    if stream is None and "vehicle_local_position" in sets:
+        faults.append("vehicle_local_position is there, but the autopilot never held its horizontal position valid")
+    if stream == "vehicle_local_position":
+        odometry, resets = _local_position(path, sets, notes)
+    elif stream is not None:
+        odometry, resets = _odometry(path, stream, sets[stream], notes)
+
+    attitude = None
+    if "vehicle_attitude" in sets:
+        t, wxyz = _attitude(sets["vehicle_attitude"])
+        attitude = Orientation(t, unit(f"{path}: vehicle_attitude", wxyz), True, "vehicle_attitude")
+    info = log.msg_info_dict
+    gnss, used_gnss = _gnss(sets), "vehicle_gps_position" in sets or "sensor_gps" in sets
+    if stream in ("vehicle_odometry", "vehicle_local_position"):
+        notes.append(
+            f"{stream} is the autopilot's own estimate"
+            + (", which GNSS goes into: it is no odometry of a flight without GNSS" if used_gnss else "")
+        )
+    triggers = next((sets[n]["timestamp"] for n in ("camera_capture", "camera_trigger") if n in sets), None)
+    return Log(
+        "ulog",
+        f"PX4 ULog, {info.get('ver_hw', 'unknown board')}, {info.get('ver_sw_branch') or info.get('ver_sw', '?')[:8]}",
+        "seconds since the autopilot's boot",
+        odometry,
+        None if stream is None or stream == "vehicle_visual_odometry" else used_gnss,
+        tuple(found),
+        _imu(sets),
+        _height(sets, odometry),
+        attitude,
+        gnss,
+        triggers_s=None if triggers is None else _s(triggers),
+        lost=tuple((d.timestamp * 1e-6, d.duration * 1e-3) for d in log.dropouts),
+        resets=tuple(resets),
+        notes=tuple(notes),
+        faults=tuple(faults),
+    )
+
+
+def _s(microseconds: Any) -> FloatArray:
+    return np.asarray(microseconds, dtype=np.float64) * 1e-6
+
+
+def _columns(data: Data, *names: str) -> FloatArray:
+    return np.stack([np.asarray(data[n], dtype=np.float64) for n in names], axis=-1)
+
+
+def _quaternions(data: Data) -> FloatArray:
+    return _columns(data, *(f"q[{i}]" for i in range(4)))
+
+
+def _positions(data: Data) -> FloatArray:
+    return _columns(
+        data, *(("x", "y", "z") if "x" in data else ("position[0]", "position[1]", "position[2]"))
+    )
+
+
+def _usable(name: str, sets: dict[str, Data]) -> bool:
+    if name == "vehicle_local_position":
+        return "vehicle_attitude" in sets and bool(np.any(_valid(sets[name])))
+    whole = np.isfinite(_positions(sets[name])).all(axis=1) & np.isfinite(_quaternions(sets[name])).all(
+        axis=1
+    )
+    return bool((whole & (np.linalg.norm(_quaternions(sets[name]), axis=1) > 0.5)).any())
+
+
+def _valid(data: Data) -> Any:
+    good = np.isfinite(_positions(data)).all(axis=1)
+    return good & (np.asarray(data["xy_valid"]) != 0) if "xy_valid" in data else good
+
+
+def _increasing(t: FloatArray) -> Any:
+    # Rows that are later than every row before them.
+    before = np.concatenate([[-np.inf], np.maximum.accumulate(t)[:-1]])
+    return t > before
+
+
+def _segments(
+    t: FloatArray, data: Data, keep: Any, counters: tuple[str, ...], what: list[tuple[float, str]]
+) -> Any:
+    segment = np.zeros(len(t), dtype=np.int64)
+    for name in counters:
+        if name in data:
+            steps = (
+                np.diff(
+                    np.asarray(data[name])[keep].astype(np.int64), prepend=np.asarray(data[name])[keep][:1]
+                )
+                != 0
+            )
+            segment += np.cumsum(steps)
+            what += [(float(t[i]), name) for i in np.flatnonzero(steps)]
+    what.sort()
+    return segment
+
+
+def _odometry(
+    path: Path, name: str, data: Data, notes: list[str]
+) -> tuple[Odometry, list[tuple[float, str]]]:
+    xyz, q = _positions(data), _quaternions(data)
+    t = _s(data["timestamp_sample"] if np.any(data.get("timestamp_sample", 0)) else data["timestamp"])
+    keep = np.isfinite(xyz).all(axis=1) & np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
+    if "pose_frame" in data:  # since 1.14: 0 unknown, 1 NED, 2 FRD
+        frame = np.asarray(data["pose_frame"])[keep]
+        ned, frd = frame == 1, frame == 2
+    else:  # before: 0 NED, 1 FRD, 2 other, 3 body; none at all in the first versions
+        frame = (
+            np.asarray(data["local_frame"])[keep] if "local_frame" in data else np.zeros(int(keep.sum()), int)
+        )
+        ned, frd = frame == 0, frame == 1
+    if not (ned.all() or frd.all()):
+        raise FlightError(
+            f"{path}: {name}: its pose frames are {sorted({int(f) for f in frame})}, not NED or FRD throughout: "
+            "choose another with --topic"
+        )
+    keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
+    t, xyz, q = t[keep], xyz[keep], q[keep]
+    resets: list[tuple[float, str]] = []
+    segment = _segments(t, data, keep, ("reset_counter",), resets)
+    turn = enu_flu_from_ned_frd if ned.all() else flu_flu_from_frd_frd
+    xyz = enu_from_ned(xyz) if ned.all() else flu_from_frd(xyz)
+    notes.append(f"{name}: pose frame {'NED' if ned.all() else 'FRD (arbitrary heading)'}")
+    return Odometry(t, xyz, turn(unit(f"{path}: {name}", q)), name, segment), resets
+
+
+def _attitude(data: Data) -> tuple[FloatArray, FloatArray]:
+    t, q = _s(data["timestamp"]), _quaternions(data)
+    keep = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
+    keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
+    return t[keep], enu_flu_from_ned_frd(q[keep])
+
+
+def _local_position(
+    path: Path, sets: dict[str, Data], notes: list[str]
+) -> tuple[Odometry, list[tuple[float, str]]]:
+    data = sets["vehicle_local_position"]
+    t = _s(data["timestamp"])
+    ta, wxyz = _attitude(sets["vehicle_attitude"])
+    keep = _valid(data) & (t >= ta[0]) & (t <= ta[-1])
+    keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
+    t, xyz = t[keep], enu_from_ned(_positions(data)[keep])
+    if not len(t):
+        raise FlightError(f"{path}: vehicle_local_position has no valid position with an attitude beside it")
+    if not keep.all():
+        notes.append(
+            f"vehicle_local_position: {int((~keep).sum())} of {len(keep)} rows are not valid and left out"
+        )
+    resets: list[tuple[float, str]] = []
+    counters = ("xy_reset_counter", "z_reset_counter", "heading_reset_counter")
+    segment = _segments(t, data, keep, counters, resets)
+    return Odometry(
+        t, xyz, mixed(ta, unit(f"{path}: vehicle_attitude", wxyz), t), "vehicle_local_position", segment
+    ), resets
+
+
+def mixed(t_s: FloatArray, wxyz: FloatArray, at_s: FloatArray) -> FloatArray:
+    """(m, 4) attitudes at ``at_s``, between neighbours by the straight mean (nlerp): they lie milliseconds apart."""
+    if len(t_s) == 1:
+        return np.repeat(wxyz, len(at_s), axis=0)
+    right = np.clip(np.searchsorted(t_s, at_s), 1, len(t_s) - 1)
+    share = np.clip((at_s - t_s[right - 1]) / (t_s[right] - t_s[right - 1]), 0.0, 1.0)[:, None]
+    first, second = wxyz[right - 1], wxyz[right]
+    second = np.where((first * second).sum(axis=1, keepdims=True) < 0.0, -second, second)
+    between = (1.0 - share) * first + share * second
+    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
+
+
+def _imu(sets: dict[str, Data]) -> Imu | None:
+    data = sets.get("sensor_combined")
+    if data is None or "gyro_rad[0]" not in data:
+        return None
+    t = _s(data["timestamp"])
+    keep = _increasing(t)
+    gyro = _columns(data, *(f"gyro_rad[{i}]" for i in range(3)))
+    accel = _columns(data, *(f"accelerometer_m_s2[{i}]" for i in range(3)))
+    return Imu(t[keep], flu_from_frd(gyro[keep]), flu_from_frd(accel[keep]))
+
+
+def _height(sets: dict[str, Data], odometry: Odometry | None) -> Height | None:
+    data = sets.get("distance_sensor")
+    if data is not None:
+        t, d = _s(data["timestamp"]), np.asarray(data["current_distance"], dtype=np.float64)
+        keep = np.isfinite(d) & (d > np.asarray(data.get("min_distance", 0.0))) & _increasing(t)
+        if "max_distance" in data:
+            keep &= d < np.asarray(data["max_distance"])
+        if "orientation" in data and (np.asarray(data["orientation"]) == _DOWN).any():
+            keep &= np.asarray(data["orientation"]) == _DOWN
+        if "signal_quality" in data:
+            keep &= np.asarray(data["signal_quality"]) != 0
+        if keep.any():
+            return Height(t[keep], d[keep], "ground", "distance_sensor")
+    data = sets.get("vehicle_local_position")
+    if data is not None and np.any(data.get("dist_bottom_valid", 0)):
+        t = _s(data["timestamp"])
+        keep = (np.asarray(data["dist_bottom_valid"]) != 0) & _increasing(t)
+        return Height(t[keep], np.asarray(data["dist_bottom"], np.float64)[keep], "ground", "dist_bottom")
+    if odometry is not None:
+        return Height(odometry.t_s, odometry.xyz_m[:, 2], "take-off", odometry.source)
+    return None
+
+
+def _gnss(sets: dict[str, Data]) -> Gnss | None:
+    data = sets.get("vehicle_gps_position", sets.get("sensor_gps"))
+    if data is None:
+        return None
+    t = _s(data["timestamp"])
+    keep = (np.asarray(data["fix_type"]) >= 3) & _increasing(t)
+    if not keep.any():
+        return None
+    if "latitude_deg" in data:  # since 1.14
+        lat, lon, alt = (
+            np.asarray(data[n], np.float64) for n in ("latitude_deg", "longitude_deg", "altitude_msl_m")
+        )
+    else:
+        lat, lon, alt = (
+            np.asarray(data[n], np.float64) * s for n, s in (("lat", 1e-7), ("lon", 1e-7), ("alt", 1e-3))
+        )
+    return Gnss(t[keep], lon[keep], lat[keep], alt[keep], np.asarray(data["eph"], np.float64)[keep])

@@ -1,0 +1,194 @@
+"""The one normal form that every log is read into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.flight.frames import QuaternionOrder
+from brmgeo.flight.readings import Camera, FloatArray, Imu, Odometry
+
+#: Stamps of one stream that go back by more than this are a clock that jumped, not messages that overtook each other.
+MAX_REORDER_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LogOptions:
+    """What a reader may be told besides the file.
+
+    Attributes:
+        topic: the odometry to take of a log that holds several (a topic, message name or estimator).
+        image_topic, imu_topic: the same for pictures and inertial readings.
+        quaternion: order of the quaternion columns of text formats.
+        frame_times_s: (n,) times for KITTI poses.
+        format: name of a text format; None finds it out.
+        any_topic: take the first candidate where several are (for a look, not for an import).
+    """
+
+    topic: str | None = None
+    image_topic: str | None = None
+    imu_topic: str | None = None
+    quaternion: QuaternionOrder | None = None
+    frame_times_s: FloatArray | None = None
+    format: str | None = None
+    any_topic: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Gnss:
+    """Satellite positions: (n,) seconds, (n,) degrees WGS84, (n,) metres or NaN; ``sigma_m`` horizontal, or NaN."""
+
+    t_s: FloatArray
+    lon_deg: FloatArray
+    lat_deg: FloatArray
+    alt_m: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Height:
+    """Height above ground: (n,) seconds, (n,) metres. ``above`` is ``ground`` (measured) or ``take-off`` (assumed flat)."""
+
+    t_s: FloatArray
+    agl_m: FloatArray
+    above: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """Attitude of the body (FLU): (n,) seconds, (n, 4) unit quaternions w, x, y, z, world_from_body, world z up.
+
+    ``north`` is True when the world is ENU, so that the yaw is a heading. ``of_camera`` is True when the body is the
+    stabilised camera (a gimbal), as a nadir camera at rest has it, and not the aircraft.
+    """
+
+    t_s: FloatArray
+    wxyz: FloatArray
+    north: bool
+    source: str
+    of_camera: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrames:
+    """Pictures: (n,) seconds and their file names; ``images`` yields (index, encoded bytes or array) in any order.
+
+    An array is (h, w) or (h, w, 3) uint8, blue first as OpenCV has it.
+    """
+
+    t_s: FloatArray
+    names: tuple[str, ...]
+    images: Callable[[], Iterator[tuple[int, bytes | NDArray[np.uint8]]]]
+    size: tuple[int, int]
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """What was read from one log. None: the log says nothing of it.
+
+    Attributes:
+        kind: ``tum``, ``euroc``, ``kitti``, ``vins-mono``, ``csv``, ``rosbag``, ``ulog``, ``ardupilot``, ``mavlink`` or
+            ``photos``.
+        title: what the log says of itself, for people.
+        clock: what ``t_s`` counts from.
+        odometry: body FLU in a z-up frame; ``odometry.source`` names topic or messages.
+        uses_gnss: True when the odometry is an estimate that GNSS went into, None when that is not known.
+        candidates: every odometry that the log holds, for ``LogOptions.topic``.
+        triggers_s: (n,) times at which the camera was triggered, for logs without pictures.
+        stamp_offset_s: stream -> median of stamp minus record time, seconds, where both are known.
+        lost: (start, seconds) of each dropout that the log reports.
+        resets: (t_s, what) as the log reports them.
+        notes: what was done or left out in reading, one sentence each.
+        faults: what stands in the way of using the log, one sentence each.
+    """
+
+    kind: str
+    title: str
+    clock: str
+    odometry: Odometry | None = None
+    uses_gnss: bool | None = None
+    candidates: tuple[str, ...] = ()
+    imu: Imu | None = None
+    height: Height | None = None
+    attitude: Orientation | None = None
+    gnss: Gnss | None = None
+    frames: CameraFrames | None = None
+    camera: Camera | None = None
+    triggers_s: FloatArray | None = None
+    stamp_offset_s: tuple[tuple[str, float], ...] = ()
+    lost: tuple[tuple[float, float], ...] = ()
+    resets: tuple[tuple[float, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+
+
+def missing_library(path: object, what: str, package: str) -> MissingInputError:
+    """The error for a log whose library is not installed."""
+    return MissingInputError(
+        f"{path}: reading {what} needs the package {package}: pip install 'brmgeo[logs]' (or pip install {package})"
+    )
+
+
+def ordered(where: str, t_s: FloatArray, notes: list[str]) -> NDArray[np.int64]:
+    """Indices that put stamps in order, each once (the last of equal ones); what was mended goes to ``notes``.
+
+    Raises FlightError where stamps go back by more than ``MAX_REORDER_S``: the clock jumped, or pieces are mixed up.
+    """
+    t = np.asarray(t_s, dtype=np.float64)
+    if not t.size:
+        return np.empty(0, dtype=np.int64)
+    fall = np.maximum.accumulate(t) - t
+    worst = int(fall.argmax())
+    if fall[worst] > MAX_REORDER_S:
+        raise FlightError(
+            f"{where}: out of order: message {worst + 1} is stamped {t[worst]:.6f} s, {fall[worst]:.3f} s before an earlier "
+            "one: its clock jumped or pieces were mixed up; cut the log there"
+        )
+    order = np.argsort(t, kind="stable")
+    keep = np.append(np.diff(t[order]) > 0.0, True)
+    late = int((np.diff(t) < 0).sum())
+    if late:
+        notes.append(
+            f"{where}: {late} messages overtook each other (by up to {fall[worst]:.3f} s) and were sorted"
+        )
+    if not keep.all():
+        notes.append(f"{where}: {int((~keep).sum())} stamps were there twice; the later message counts")
+    return np.asarray(order[keep], dtype=np.int64)
+
+
+def unit(where: str, wxyz: FloatArray) -> FloatArray:
+    """(n, 4) normalised; FlightError where one has no length near 1."""
+    length = np.linalg.norm(wxyz, axis=1)
+    bad = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
+    if bad.size:
+        i = int(bad[0])
+        raise FlightError(
+            f"{where}: message {i + 1}: the quaternion's length is {length[i]:.4f}, not 1: no orientation is there; "
+            "choose another topic"
+        )
+    return np.asarray(wxyz / length[:, None])
+
+
+def choose(
+    path: object, what: str, option: str, wanted: str | None, found: dict[str, int], any_topic: bool
+) -> str | None:
+    """The stream to take of ``found`` (name -> messages); None when there is none.
+
+    Raises FlightError that lists the candidates when ``wanted`` is not there or several are.
+    """
+    listed = ", ".join(f"{name} ({count})" for name, count in found.items())
+    if wanted is not None:
+        if wanted in found:
+            return wanted
+        raise FlightError(
+            f"{path}: no {what} named {wanted!r}: there {'is ' + listed if listed else 'is none'}"
+        )
+    if len(found) > 1 and not any_topic:
+        raise FlightError(f"{path}: {len(found)} streams hold {what}: choose one with {option}: {listed}")
+    return next(iter(found), None)
