@@ -53,18 +53,22 @@ Inputs = Mapping[str, Path]
 
 def run_source(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     """Writes the sheets, the imagery tiles and the manifest of a generated region."""
-    from brmgeo.synth.imagery import write_kakao_tiles
-    from brmgeo.synth.sheets import write_sheets
-    from brmgeo.synth.town import generate_town
+    from brmgeo.synth.region import write_region
 
-    town = generate_town(_bounds(settings["bounds"]), settings["seed"], crs=settings["crs"])
-    manifest = write_sheets(town, out / "sheets", settings["sheets"])
-    tiles = write_kakao_tiles(town, out / "tiles", settings["level"])
-    manifest |= {"buildings": len(town.buildings), "area_m2": town.built_area_m2(), "tiles": tiles}
-    (out / "manifest.json").write_text(
-        json.dumps(manifest, ensure_ascii=False, indent=1) + "\n", encoding="utf-8"
+    manifest = write_region(
+        out,
+        _bounds(settings["bounds"]),
+        settings["seed"],
+        settings["sheets"],
+        crs=settings["crs"],
+        level=settings["level"],
+        map=map,
     )
-    return {"buildings": len(town.buildings), "area_m2": round(town.built_area_m2(), 2), "tiles": tiles}
+    return {
+        "buildings": manifest["buildings"],
+        "area_m2": round(manifest["area_m2"], 2),
+        "tiles": manifest["tiles"],
+    }
 
 
 # --- outlines: one file of footprints, repaired, in the region's CRS ------------------------------------------
@@ -425,7 +429,7 @@ def run_overview(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     return {}
 
 
-SOURCE = Stage("source", 1, run_source)
+SOURCE = Stage("source", 2, run_source)
 OUTLINES = Stage("outlines", 1, run_outlines)
 LATTICE = Stage("lattice", 1, run_lattice)
 FOOTPRINTS = Stage("footprints", 1, run_footprints)

@@ -33,6 +33,7 @@ F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 _SHIFT = 4
 _WINDOW_PX = 1024
+_BLOCK_PX = 2048
 _PERIOD_PX = 1024
 _TILED_PX = 2112
 _CANOPY_PX = 1536
@@ -956,30 +957,43 @@ def write_kakao_tiles(town: Town, out_dir: Path, level: int = 1, ext: str = "jpg
     tiles. Levels 1 (0.25 m) to 3 (1 m) make sense.
     """
     grid = KakaoGrid()
-    gsd = grid.gsd_m(level)
-    tiles = grid.covering(town.bounds, town.crs, level, margin_px=4.0)
-    painter = Painter(town, grid.crs, gsd)
-    group = _WINDOW_PX // grid.tile_px
-    patches: dict[tuple[int, int], list[Tile]] = {}
-    for tile in tiles:
-        patches.setdefault((tile.y // group, tile.x // group), []).append(tile)
+    painter = Painter(town, grid.crs, grid.gsd_m(level))
+    return sum(
+        write_tiles(painter, block, out_dir, level, ext, quality) for block in tile_blocks(town, level)
+    )
+
+
+def tile_blocks(town: Town, level: int) -> list[list[Tile]]:
+    """The tiles of Kakao's grid that ``town.bounds`` touches, in blocks that are painted in one go."""
+    grid = KakaoGrid()
+    group = _BLOCK_PX // grid.tile_px
+    found: dict[tuple[int, int], list[Tile]] = {}
+    for tile in grid.covering(town.bounds, town.crs, level, margin_px=4.0):
+        found.setdefault((tile.y // group, tile.x // group), []).append(tile)
+    return [block for _, block in sorted(found.items())]
+
+
+def write_tiles(
+    painter: Painter, block: list[Tile], out_dir: Path, level: int, ext: str = "jpg", quality: int = 86
+) -> int:
+    """Paints and writes one of ``tile_blocks``, with a painter in the grid's CRS and at the level's GSD; their number."""
+    grid = KakaoGrid()
+    gsd, px = grid.gsd_m(level), grid.tile_px
     options = (
         [cv2.IMWRITE_JPEG_QUALITY, quality] if ext in ("jpg", "jpeg") else [cv2.IMWRITE_PNG_COMPRESSION, 6]
     )
-    px = grid.tile_px
-    for (_, _), members in sorted(patches.items()):
-        spans = [grid.tile_bounds(t, level) for t in members]
-        left, top = min(s[0] for s in spans), max(s[3] for s in spans)
-        right, bottom = max(s[2] for s in spans), min(s[1] for s in spans)
-        row0, col0 = round(-top / gsd), round(left / gsd)
-        patch = painter.paint(row0, col0, round((top - bottom) / gsd), round((right - left) / gsd))
-        for tile, span in zip(members, spans):
-            r, c = round((top - span[3]) / gsd), round((span[0] - left) / gsd)
-            path = out_dir / grid.path(tile, level, ext)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            bgr = np.ascontiguousarray(patch[r : r + px, c : c + px, ::-1])
-            ok, data = cv2.imencode(f".{ext}", bgr, options)
-            if not ok:  # pragma: no cover - the encoder takes any uint8 picture
-                raise ValueError(f"cannot encode a tile as {ext!r}")
-            path.write_bytes(data.tobytes())
-    return len(tiles)
+    spans = [grid.tile_bounds(t, level) for t in block]
+    left, top = min(s[0] for s in spans), max(s[3] for s in spans)
+    right, bottom = max(s[2] for s in spans), min(s[1] for s in spans)
+    row0, col0 = round(-top / gsd), round(left / gsd)
+    patch = painter.paint(row0, col0, round((top - bottom) / gsd), round((right - left) / gsd))
+    for tile, span in zip(block, spans):
+        r, c = round((top - span[3]) / gsd), round((span[0] - left) / gsd)
+        path = out_dir / grid.path(tile, level, ext)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        bgr = np.ascontiguousarray(patch[r : r + px, c : c + px, ::-1])
+        ok, data = cv2.imencode(f".{ext}", bgr, options)
+        if not ok:  # pragma: no cover - the encoder takes any uint8 picture
+            raise ValueError(f"cannot encode a tile as {ext!r}")
+        path.write_bytes(data.tobytes())
+    return len(block)

@@ -68,6 +68,7 @@ def write_sheets(
     numbers: Sequence[str],
     versions: Sequence[str] = ("R12", "R2013"),
     faults: Sequence[tuple[str, int]] = FAULTS,
+    only: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Writes ``out_dir``/NUMBER.dxf for each sheet number and returns the manifest.
 
@@ -77,6 +78,7 @@ def write_sheets(
         versions: DXF release of each sheet, repeated as needed: "R12" (AC1009 in cp949, POLYLINE) or any later one of ezdxf
             (LWPOLYLINE; "R2013" is AC1027).
         faults: kinds and counts to inject in every sheet.
+        only: those of ``numbers`` to write now, each the same as if all were; all by default.
 
     Returns the manifest, ready for JSON: ``crs`` and for each sheet ``file``, ``version``, ``outlines`` (true footprints in
     it), ``area_m2`` (exact union of its buildings), ``bounds``, ``cut`` (footprints cut by the neatline), ``entities``,
@@ -91,6 +93,7 @@ def write_sheets(
         sheets = {
             number: _write_sheet(town, out_dir, number, versions[i % len(versions)], faults, i)
             for i, number in enumerate(numbers)
+            if only is None or number in only
         }
     finally:
         options.write_fixed_meta_data_for_testing = before
