@@ -4,7 +4,7 @@
 
 Masks-only flights along the paper's rectangle over built-up ground, with odometry like VINS-Mono's. With ``--off-map`` all
 buildings within 250 m of each path are taken out of the map first: no fix may come of that. Without
-``--footprints`` the real sheet in BRMGEO_REAL_DATA (default ../shared/data) is used where it is present, else a generated town.
+``--footprints`` the real sheet in BRMGEO_REAL_DATA (default ../shared/data) is used where present, else a generated town.
 """
 
 from __future__ import annotations

@@ -105,9 +105,9 @@ class GridMatcher(ABC):
     def _evidence(self, view: View) -> tuple[float, float]:
         """Ground that the evidence comes from, square metres, and its weight per share of new ground."""
 
-    def _confirms(self) -> bool:
-        """Whether a first fix needs a measured pose."""
-        return False
+    def _least_fit(self) -> float:
+        """How well a measured pose must fit before there is a first fix; 0 when none is needed."""
+        return 0.0
 
     @abstractmethod
     def _learn(self, view: View, anchor: Anchor) -> None:
@@ -128,8 +128,9 @@ class GridMatcher(ABC):
         self._anchors.append(None)
         if started:
             self._predict(motion)
-        if motion.compass_yaw_rad is not None and motion.yaw_rad is not None:
-            self._weigh_compass(motion.compass_yaw_rad - motion.yaw_rad)
+        if motion.compass_yaw_rad is not None and (motion.yaw_rad is not None or motion.step_m is None):
+            # Without odometry the belief's heading is the body's own.
+            self._weigh_compass(motion.compass_yaw_rad - (motion.yaw_rad or 0.0))
         self._look(view)
         self._update(view, motion)
         mode = self.belief.mode(self.settings.belief.mode_radius_m / self.cell_m)
@@ -283,7 +284,7 @@ class GridMatcher(ABC):
         # The part of the levelling error that lasts the whole flight is averaged away by no filter.
         cov = cov + np.eye(2) * (self.settings.odometry.attitude_sigma_rad * view.agl_m) ** 2
         sigma = math.sqrt(float(np.trace(cov)) / 2.0)
-        if sure and sigma <= s.converged_sigma_m and (self._confirmed or not self._confirms()):
+        if sure and sigma <= s.converged_sigma_m and (self._confirmed or self._least_fit() <= 0):
             status = "converged"
             self._unfixed_searches = 0
         else:
@@ -333,9 +334,11 @@ class GridMatcher(ABC):
             d2 = track.distance2(anchor.pose, anchor.covariance, turn)
             if d2 < 16.3 or fresh:
                 track.update(anchor.pose, anchor.covariance, turn)
-                self._misses, self._confirmed = 0, True
-                self._anchors[-1] = anchor
-                self._learn(view, anchor)
+                self._misses = 0
+                self._confirmed |= anchor.fit >= self._least_fit()
+                if self._confirmed:
+                    self._anchors[-1] = anchor
+                    self._learn(view, anchor)
             else:
                 self._misses += 1
                 if self._misses >= 3:

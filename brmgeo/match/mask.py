@@ -33,8 +33,8 @@ class MaskMatcher(GridMatcher):
     def _bounds(self) -> tuple[float, float]:
         return self.settings.rates.llr_min, self.settings.rates.llr_max
 
-    def _confirms(self) -> bool:
-        return True
+    def _least_fit(self) -> float:
+        return self.settings.rates.least_fit
 
     def _evidence(self, view: View) -> tuple[float, float]:
         return float(np.count_nonzero(view.known)) * view.gsd_m**2, self.settings.rates.repeat
@@ -71,11 +71,10 @@ class MaskMatcher(GridMatcher):
         if max(found.covariance[0, 0], found.covariance[1, 1]) > 9.0:
             return None
         on_both, missed, extra, _ = found.counts
-        if 2 * on_both < self.settings.rates.least_fit * (2 * on_both + missed + extra):
-            return None
+        fit = 2 * on_both / max(2 * on_both + missed + extra, 1.0)
         # The frame's own share of the levelling error; the flight's own is added to what is reported.
         tilt = (self.settings.odometry.attitude_sigma_rad * view.agl_m) ** 2
-        return Anchor(found.pose, found.covariance + np.diag([tilt, tilt, 0.0]))
+        return Anchor(found.pose, found.covariance + np.diag([tilt, tilt, 0.0]), fit)
 
     def _learn(self, view: View, anchor: Anchor) -> None:
         assert self._points is not None

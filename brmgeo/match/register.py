@@ -72,7 +72,7 @@ class Registration:
         llr: log-likelihood ratio of the best pose against the background.
         contrast: how far the best pose lies above the window's median.
         counts: square metres (building, other) over mapped buildings, then elsewhere on known ground.
-        edge: whether the posterior touches the window's edge, so the pose may lie outside.
+        edge: whether the posterior of the place touches the window's edge, so it may lie outside.
     """
 
     pose: F64
@@ -127,7 +127,7 @@ class Registrar:
         fine = view_points(view, max(gsd, 1.0))
         half = math.ceil(min(2.5 * spread + 0.5 * cell, 3.0 * cell) / gsd)
         fine_step = max(gsd / max(fine.reach_m, gsd), 0.0025)
-        n = math.ceil((2.5 * math.sqrt(cov[2, 2]) + 0.5 * step) / fine_step)
+        n = math.ceil(min(2.5 * math.sqrt(cov[2, 2]) + 0.5 * step, window_rad + step) / fine_step)
         yaw = first[2] + fine_step * np.arange(-n, n + 1)
         crop, origin = self._crop(centre, fine.reach_m + half * gsd + 2.0)
         score, at = self._scores(fine, centre, yaw, half, rates, crop, gsd, origin)
@@ -241,6 +241,8 @@ def _moments(score: F32, yaw: F64, cell: float) -> tuple[F64, F64, bool]:
     step = float(yaw[1] - yaw[0]) if len(yaw) > 1 else 0.0
     cov += np.diag([cell**2, cell**2, step**2]) / 12.0
     edge = by_row[0] + by_row[-1] + by_col[0] + by_col[-1] > 0.02
-    if len(yaw) > 2:
-        edge |= by_yaw[0] + by_yaw[-1] > 0.05
+    if len(yaw) > 2 and by_yaw[0] + by_yaw[-1] > 0.05:
+        # Few buildings leave the yaw open: the window's own middle and width must not pass for a measurement of it.
+        cov[2, :2] = cov[:2, 2] = 0.0
+        cov[2, 2] = math.pi**2
     return mean, cov, bool(edge)

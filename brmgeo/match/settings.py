@@ -76,8 +76,8 @@ class RateSettings:
         repeat: weight of a view's evidence per share of new ground in it, [0.1, 100]: views overlap, and what
             two of them show counts little more than once, else a hovering aircraft would grow sure of a place
             that only looks alike. 1 would hold if masks of the same ground always had the same errors.
-        least_fit: a registered view counts only when building in view and map overlap this well (Dice: twice
-            the common area over the sum of both), [0, 1]; the first fix needs one such view.
+        least_fit: the first fix needs a registered view in which building and map overlap this well (Dice: twice
+            the common area over the sum of both), [0, 1].
         learn: whether P1 falls and P0 rises when registered frames fit worse than these say; they never get
             more trusting.
 

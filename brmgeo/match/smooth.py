@@ -46,10 +46,11 @@ class SmoothedPath:
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """A measured pose: (3,) x, y, yaw of the body, and its (3, 3) covariance."""
+    """A measured pose: (3,) x, y, yaw of the body, its (3, 3) covariance, and how well the view overlaps the map (Dice)."""
 
     pose: F64
     covariance: F64
+    fit: float = 1.0
 
 
 def smooth_path(

@@ -162,6 +162,7 @@ def test_kidnapped_aircraft_is_found_again() -> None:
 
 def test_without_odometry_the_status_is_honest() -> None:
     f = flight(odometry=False, missed=0.05)
+    f = replace(f, motions=[replace(m, compass_yaw_rad=float(a)) for m, a in zip(f.motions, f.yaw)])
     settings = replace(QUICK, odometry=OdometrySettings(max_speed_m_s=8.0))
     estimates = run(make_matcher("mask", GROUND, settings), f)
     error = errors(f, estimates)
