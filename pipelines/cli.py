@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +91,10 @@ def cli() -> None:
 )
 @click.option("--layer", help="With --footprints: the layer to read of files that hold several.")
 @click.option("--encoding", help="With --footprints: text encoding of shapefiles without .cpg.")
+@click.option(
+    "--source-crs",
+    help="With --footprints: the CRS of files that do not say theirs (shapefiles without .prj).",
+)
 @click.option("--repairs", is_flag=True, help="Also write what was repaired as a layer of footprints.gpkg.")
 def maps(
     region: str | None,
@@ -104,6 +110,7 @@ def maps(
     radii_m: tuple[float, ...] | None,
     layer: str | None,
     encoding: str | None,
+    source_crs: str | None,
     repairs: bool,
 ) -> None:
     """Build all maps of REGION: footprints, imagery, building mask, ratio maps, preview, QGIS project."""
@@ -117,7 +124,18 @@ def maps(
                 "maps --footprints: give --crs (such as EPSG:5187) and --out (a folder for the results)"
             )
         spec = job.region_of_files(
-            out, footprints, crs, imagery, sheets, bounds, gsd_m, radii_m, layer, encoding, repairs
+            out,
+            footprints,
+            crs,
+            imagery,
+            sheets,
+            bounds,
+            gsd_m,
+            radii_m,
+            layer,
+            encoding,
+            source_crs,
+            repairs,
         )
         job.build_maps(spec, out / ".brmgeo", out, Path.cwd(), scheduler)
         return
@@ -191,6 +209,11 @@ def why(region: str, stage: str, data: Path) -> None:
 @click.option("--name", help="Name of the flight (default simulated-SEED).")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option(
+    "--count",
+    type=click.IntRange(min=1),
+    help="Simulate this many flights, with seeds from --seed on, side by side; --out is then the folder of their folders.",
+)
+@click.option(
     "--path",
     default="rectangle",
     show_default=True,
@@ -206,6 +229,11 @@ def why(region: str, stage: str, data: Path) -> None:
 @click.option(
     "--scale-bias", type=float, help="Scale bias of the odometry, such as 0.05 (default: drawn, sigma 5 %)."
 )
+@click.option(
+    "--season",
+    type=click.Choice(["spring", "summer", "autumn", "winter"]),
+    help="Draw the frames of a generated REGION as it is on another day of this season: other light, crops and cars.",
+)
 @click.option("--no-odometry", is_flag=True, help="Fly without odometry.")
 @click.option("--compass", is_flag=True, help="Write a compass heading (3 deg) into frames.csv.")
 def simulate(
@@ -216,34 +244,42 @@ def simulate(
     out: Path | None,
     name: str | None,
     seed: int,
+    count: int | None,
     path: str,
     mode: str,
     scale_bias: float | None,
+    season: str | None,
     no_odometry: bool,
     compass: bool,
 ) -> None:
     """Simulate a flight over REGION: frames, masks, odometry, IMU, altimeter and reference in one folder."""
     from pipelines import flights as job
 
+    if out is None and region is None:
+        raise SettingsError("simulate --maps: give --out, the flight folder to write")
+    if count is not None and name is not None:
+        raise SettingsError(
+            "simulate --count: each flight is named by its seed, simulated-SEED; leave --name out"
+        )
+    if season is not None and (region is None or mode == "masks"):
+        raise SettingsError("simulate --season: needs a generated REGION, and --mode frames or both")
     own, folder, _ = job.maps_for("simulate", region, maps_dir, data, scheduler)
-    name = name or f"simulated-{seed}"
-    if out is None:
-        if region is None:
-            raise SettingsError("simulate --maps: give --out, the flight folder to write")
-        out = data / "source" / own.name / "flights" / name
-    job.simulate_flight(
-        job.read_maps(folder.absolute()),
-        out,
-        own.flight,
-        seed,
-        path,
-        mode,
-        scale_bias,
-        no_odometry,
-        compass,
-        name,
+    what = job.Simulation(
+        folder.absolute(), own.flight, path, mode, scale_bias, no_odometry=no_odometry, compass=compass
     )
-    click.echo(f"wrote {out}")
+    flights = data / "source" / own.name / "flights"
+    with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
+        if season is not None:
+            picture = job.other_day(own, folder, season, seed, Path(scratch) / "other-day.tif")
+            what = replace(what, imagery=picture)
+        if count is None:
+            name = name or f"simulated-{seed}"
+            click.echo(f"wrote {job.simulate_flight(what, seed, out or flights / name, name)}")
+            return
+        names = [(s, f"simulated-{s}") for s in range(seed, seed + count)]
+        jobs = [(s, (out or flights) / n, n) for s, n in names]
+        job.simulate_flights(what, jobs, scheduler)
+        click.echo(f"wrote {count} flights, {names[0][1]} to {names[-1][1]}, into {out or flights}")
 
 
 @cli.command()
@@ -264,7 +300,17 @@ def simulate(
 @click.option(
     "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the simulated flight."
 )
-@click.option("--compass", is_flag=True, help="Trust yaw_deg of frames.csv as a compass heading.")
+@click.option(
+    "--compass",
+    is_flag=True,
+    help="Trust yaw_deg of frames.csv as a compass heading (clockwise from true north).",
+)
+@click.option(
+    "--max-speed",
+    "max_speed_m_s",
+    type=click.FloatRange(0.1, 500),
+    help="Metres per second that bound the movement where there is no odometry (default: the region's, 20).",
+)
 @click.option(
     "--sift", is_flag=True, help="Also match the frames to the imagery by SIFT, the paper's Fig. 1."
 )
@@ -278,6 +324,7 @@ def localize(
     out: Path | None,
     seed: int,
     compass: bool,
+    max_speed_m_s: float | None,
     sift: bool,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
@@ -300,6 +347,7 @@ def localize(
         flight_settings=own.flight,
         compass=compass,
         sift=sift,
+        max_speed_m_s=max_speed_m_s,
         attribution=attribution,
     )
 
@@ -374,6 +422,117 @@ def evaluate(
     )
 
 
+@cli.command("import")
+@click.argument("log", type=FILE)
+@click.option("--out", type=DATA, required=True, help="The flight folder to write.")
+@click.option("--name", help="Name of the flight (default: the log's).")
+@click.option("--topic", help="The odometry to take where the log holds several.")
+@click.option("--image-topic", help="The pictures to take where a bag holds several cameras.")
+@click.option("--imu-topic", help="The inertial readings to take where a bag holds several.")
+@click.option(
+    "--format", "format_name", help="tum, euroc, kitti, vins-mono, vins-fusion or csv, of a text file."
+)
+@click.option("--quaternion", type=click.Choice(["wxyz", "xyzw"]), help="Order of a text file's quaternions.")
+@click.option("--times", type=FILE, help="Times of KITTI poses: a text file, one time a line.")
+@click.option("--photos", type=FILE, help="Photos taken at the camera triggers that the log tells.")
+@click.option("--video", type=FILE, help="A video of the flight.")
+@click.option(
+    "--video-start", type=float, default=0.0, help="The log's time at which the video begins, seconds."
+)
+@click.option("--fov", "fov_deg", type=float, help="Field of view across the short side, degrees.")
+@click.option("--camera", type=_Numbers(), help="fx,fy,cx,cy[,k1,k2,p1,p2,k3] in pixels.")
+@click.option("--agl", "agl_m", type=float, help="Height above ground, metres, the same for all frames.")
+@click.option(
+    "--ground", "ground_m", type=float, help="Height of the ground above the GNSS altitude's datum, metres."
+)
+@click.option(
+    "--mount", type=_Numbers(3), default=(0.0, 0.0, 0.0), help="Camera in the body: roll,pitch,yaw degrees."
+)
+@click.option(
+    "--body",
+    type=_Numbers(3),
+    default=(0.0, 0.0, 0.0),
+    help="The log's body in ours: roll,pitch,yaw degrees.",
+)
+@click.option(
+    "--axes",
+    type=click.Choice(["flu", "optical"]),
+    default="flu",
+    show_default=True,
+    help="Axes of the odometry.",
+)
+@click.option("--imu-units", help="Units of the log's IMU where they are others: deg/s, g or mg, by commas.")
+@click.option("--rate", "rate_hz", type=float, help="Take at most this many frames a second.")
+@click.option("--shift-frames", type=float, default=0.0, help="Seconds to add to the frames' times.")
+def import_(
+    log: Path,
+    out: Path,
+    name: str | None,
+    topic: str | None,
+    image_topic: str | None,
+    imu_topic: str | None,
+    format_name: str | None,
+    quaternion: Any,
+    times: Path | None,
+    photos: Path | None,
+    video: Path | None,
+    video_start: float,
+    fov_deg: float | None,
+    camera: tuple[float, ...] | None,
+    agl_m: float | None,
+    ground_m: float | None,
+    mount: tuple[float, ...],
+    body: tuple[float, ...],
+    axes: str,
+    imu_units: str | None,
+    rate_hz: float | None,
+    shift_frames: float,
+) -> None:
+    """Make a flight folder of LOG: a ROS bag, PX4 or ArduPilot log, text of poses, or a folder of geotagged photos."""
+    from brmgeo.flight.logs import LogOptions
+    from pipelines import logs as job
+
+    units = tuple(u.strip() for u in (imu_units or "").split(",") if u.strip())
+    for unit in units:
+        if unit not in ("deg/s", "g", "mg"):
+            raise SettingsError(f"import: --imu-units {unit!r} is unknown: known are deg/s, g, mg")
+    if camera is not None and len(camera) not in (4, 9):
+        raise SettingsError(
+            f"import: --camera has {len(camera)} numbers: give fx,fy,cx,cy or these and k1,k2,p1,p2,k3"
+        )
+    options = LogOptions(
+        topic, image_topic, imu_topic, quaternion, job.times_of(times) if times else None, format_name
+    )
+    settings = job.ImportSettings(
+        options, name, photos, video, video_start, fov_deg, camera, agl_m, ground_m, mount, body, axes, units, rate_hz,
+        shift_frames,
+    )  # fmt: skip
+    for line in job.import_log(log, out, settings):
+        click.echo(line)
+    click.echo(f"wrote {out}")
+
+
+@cli.command()
+@click.argument("paths", type=FILE, nargs=-1, required=True)
+@click.option("--topic", help="The odometry to look at where the log holds several.")
+@click.option("--times", type=FILE, help="Times of KITTI poses: a text file, one time a line.")
+@click.option("--write", type=click.Path(path_type=Path), help="Write it as Markdown into this file.")
+def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, write: Path | None) -> None:
+    """Tell what is in PATHS (logs, bags, photo or flight folders): how long, how far, where, gaps, rates, units, faults."""
+    from brmgeo.flight.logs import LogOptions
+    from pipelines import logs as job
+
+    if write is not None:
+        write.write_text(job.inspect_document([p for p in paths if p.name != "SOURCE.txt"]), encoding="utf-8")
+        click.echo(f"wrote {write}")
+        return
+    for path in paths:
+        for line in job.inspect(
+            path, LogOptions(topic, frame_times_s=job.times_of(times) if times else None)
+        ):
+            click.echo(line)
+
+
 def main() -> None:
     """Entry point of the ``brmgeo`` command."""
     sys.exit(run(lambda: cli(standalone_mode=False)))
@@ -392,7 +551,9 @@ def run(command: Callable[[], Any]) -> int:
     except click.ClickException as error:
         own = getattr(error, "ctx", None)
         name = own.command_path if own else "brmgeo"
-        click.echo(f"{name}: {' '.join(error.format_message().split()).rstrip('.')}; see {name} --help", err=True)
+        click.echo(
+            f"{name}: {' '.join(error.format_message().split()).rstrip('.')}; see {name} --help", err=True
+        )
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
         click.echo(

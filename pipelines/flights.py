@@ -16,19 +16,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.evaluate.figures import (
     Background,
     Paths,
+    Seen,
     curves_figure,
     first_candidates_figure,
     paths_figure,
+    seen_figure,
     shrinking_figure,
 )
-from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, render_report
+from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, render_report, verdict
 from brmgeo.evaluate.scores import Scores, dead_reckoning, score
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
 from brmgeo.export.cog import box_of, read_overview, read_window
@@ -54,6 +55,7 @@ from pipelines.regions import region_named
 
 FloatArray = NDArray[np.float64]
 CANDIDATES_A_FRAME = 20_000
+SIMULATED_NOTE = "# Simulated by brmgeo"
 PATHS = ("rectangle", "lawnmower", "random")
 
 
@@ -179,12 +181,17 @@ def localize(
     flight_settings: FlightSettings | None = None,
     compass: bool = False,
     sift: bool = False,
+    max_speed_m_s: float | None = None,
     attribution: str = "",
-    simulated: bool | None = None,
 ) -> Path:
-    """Locates a flight over built maps and writes all its results into ``out``; returns the report's path."""
+    """Locates a flight over built maps and writes all its results into ``out``; returns the report's path.
+
+    ``out`` is replaced as a whole, at the end: a run that fails leaves what was there. ``max_speed_m_s`` bounds the
+    movement where odometry says nothing (default: the region's).
+    """
     if method not in METHODS:
         raise SettingsError(f"METHOD {method!r} is not known: choose one of {', '.join(METHODS)}")
+    _may_replace(out, "fixes.csv", "results of localize")
     progress = Progress()
     maps = read_maps(maps_dir.absolute())
     flight = read_flight(flight_dir)
@@ -194,15 +201,18 @@ def localize(
         raise InputError(
             f"{flight_dir / 'frames.csv'}: --compass is given, but there is no column yaw_deg; add it or leave --compass out"
         )
-    settings = match_settings(flight_settings or FlightSettings())
-    steps = motions(flight.odometry, flight.times_s, compass_yaw_rad=yaws)
+    own = flight_settings or FlightSettings()
+    if max_speed_m_s is not None:
+        own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
+    settings = match_settings(own)
+    steps = motions_of(flight, yaws)
     with progress.stage(f"{flight.name} {method}") as bar:
         views = bar.watch(serial_map)(
             functools.partial(view_at, flight, maps.ground.gsd_m), range(len(flight.frames))
         )
         located = locate(maps.ground, views, steps, method, settings)
     truth = None if reference is None else reference.at(flight.times_s)
-    source = ("simulated" if simulated else "real") if simulated is not None else _source_of(flight)
+    source = _source_of(flight)
     with _whole_folder(out) as scratch:
         _write_results(
             scratch, out, maps, flight, located, steps, truth, method, settings, source, sift, attribution
@@ -217,8 +227,26 @@ def _middle(maps: Maps) -> tuple[float, float]:
     return (left + right) / 2, (bottom + top) / 2
 
 
+def motions_of(flight: Flight, compass_yaw_rad: list[float | None] | None = None) -> list[Motion]:
+    """The flight's motions; without odometry a trusted compass also says how the body turned between frames."""
+    steps = motions(flight.odometry, flight.times_s, compass_yaw_rad=compass_yaw_rad)
+    if flight.odometry is None and compass_yaw_rad is not None:
+        steps = [replace(m, yaw_rad=m.compass_yaw_rad) for m in steps]
+    return steps
+
+
 def _source_of(flight: Flight) -> str:
-    return "simulated" if flight.name.startswith("simulated") else "as given"
+    text = (flight.folder / "flight.toml").read_text(encoding="utf-8-sig")
+    return "simulated" if text.startswith(SIMULATED_NOTE) else "as given"
+
+
+def _may_replace(out: Path, sign: str, what: str) -> None:
+    """SettingsError when ``out`` holds files that this command did not write: they would be lost."""
+    if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / sign).is_file()):
+        raise SettingsError(
+            f"--out {out}: there are other files than {what}, and the folder is replaced as a whole; "
+            "give a new folder or an empty one"
+        )
 
 
 @contextmanager
@@ -227,21 +255,24 @@ def _whole_folder(out: Path) -> Iterator[Path]:
     out = out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    os.chmod(scratch, 0o755)
     try:
         yield scratch
         old = scratch.with_name(f"{scratch.name}.old")
         if out.exists():
             os.rename(out, old)
-        os.rename(scratch, out)
-        os.chmod(out, 0o755)
+        try:
+            os.rename(scratch, out)
+        except BaseException:
+            if old.exists():
+                os.rename(old, out)
+            raise
         shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _sentence(located: Located, truth: FloatArray | None, steps: Sequence[Motion]) -> str:
-    from brmgeo.evaluate.report import verdict
-
     scores = None if truth is None else score(located.estimates, located.smoothed.xy, steps, truth)
     return verdict(scores, len(located.estimates), [e.status for e in located.estimates])[0].rstrip(".")
 
@@ -315,7 +346,7 @@ def _write_results(
     tables = []
     if sift and maps.imagery is not None and flight.has_images:
         tables.append(sift_table(maps, flight, truth))
-    figures = _figures(maps, estimates, smoothed, steps, truth)
+    figures = _figures(maps, flight, estimates, smoothed, steps, truth)
     fixes = (folder / "fixes.csv").read_text(encoding="utf-8").splitlines()
     text = render_report(
         title=f"{flight.name}, {method}",
@@ -355,6 +386,7 @@ def _plain_settings(settings: MatchSettings, method: str) -> dict[str, Any]:
 
 def _figures(
     maps: Maps,
+    flight: Flight,
     estimates: list[Estimate],
     smoothed: SmoothedPath,
     steps: Sequence[Motion],
@@ -386,8 +418,16 @@ def _figures(
             "image/svg+xml",
         ),
         ReportFigure(
+            "What the camera saw",
+            "Some frames, the building mask of each as the matcher gets it (levelled, nose up, grey where nothing is "
+            "known), and the building map at the online fix, turned alike, with the mask's outlines on it.",
+            seen_figure(_seen(maps, flight, estimates)),
+            "image/png",
+        ),
+        ReportFigure(
             "Candidates of the first frame",
-            "Every place that fits the first frame, over the building mask (after the paper's Fig. 10).",
+            "Every place that fits the first frame, over the building mask (after the paper's Fig. 10); the stronger the "
+            "red, the more probable.",
             first_candidates_figure(mask, estimates[0], None if truth is None else truth[0]),
             "image/png",
         ),
@@ -398,6 +438,41 @@ def _figures(
             "image/png",
         ),
     ]
+
+
+def _seen(maps: Maps, flight: Flight, estimates: Sequence[Estimate]) -> list[Seen]:
+    """Four frames: spread over the fixes, or over the flight where there is none."""
+    fixed = [i for i, e in enumerate(estimates) if e.status == "converged"]
+    pool = np.array(fixed or range(len(estimates)))
+    chosen = pool[np.unique(np.linspace(0, len(pool) - 1, min(4, len(pool))).round().astype(int))]
+    out = []
+    for i in chosen.tolist():
+        view, estimate = view_at(flight, maps.ground.gsd_m, i), estimates[i]
+        at_fix = estimate.status == "converged" and math.isfinite(estimate.yaw_rad)
+        out.append(
+            Seen(
+                f"frame {i + 1}, {estimate.t_s - estimates[0].t_s:.0f} s, {estimate.status}",
+                flight.image(i) if flight.has_images else None,
+                view.building,
+                view.known,
+                _below(maps.ground, view, estimate.mean, estimate.yaw_rad) if at_fix else None,
+            )
+        )
+    return out
+
+
+def _below(ground: GroundMap, view: View, xy: FloatArray, yaw_rad: float) -> NDArray[np.uint8]:
+    """(h, w) uint8 building map at each pixel of a view whose nadir is at ``xy``; 255 beyond the map."""
+    rows, cols = np.indices(view.building.shape) + 0.5
+    ahead, left = (view.nadir_px[0] - rows) * view.gsd_m, (view.nadir_px[1] - cols) * view.gsd_m
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    col = np.floor((xy[0] + ahead * c - left * s - ground.left) / ground.gsd_m).astype(np.int64)
+    row = np.floor((ground.top - xy[1] - ahead * s - left * c) / ground.gsd_m).astype(np.int64)
+    h, w = ground.building.shape
+    inside = (row >= 0) & (row < h) & (col >= 0) & (col < w)
+    out = np.full(view.building.shape, 255, np.uint8)
+    out[inside] = ground.building[row[inside], col[inside]]
+    return out
 
 
 def _background(path: Path) -> Background:
@@ -444,8 +519,10 @@ def sift_table(maps: Maps, flight: Flight, truth: FloatArray | None) -> ReportTa
                 f"{right / total:.0%}",
             ),
         ),
-        "Frames that were rendered from this very imagery match it far better than a real camera would match an old "
-        "orthophoto: for simulated flights this row says little against the building maps.",
+        "Frames that were drawn from this very imagery match it far better than a real camera would match an old "
+        "orthophoto: simulate with --season to draw them from another day's."
+        if _source_of(flight) == "simulated"
+        else "",
     )
 
 
@@ -486,7 +563,7 @@ def flight_path(
     kind: str, ground: Any, seed: int, bounds: tuple[float, float, float, float], crs: str
 ) -> FloatArray:
     """(n, 2) waypoints: a named shape placed over built-up ground by the seed, or the line of a GeoJSON file."""
-    from brmgeo.synth.flight import lawnmower, place, random_mission, rectangle
+    from brmgeo.synth.flight import lawnmower, path_from_geojson, place, random_mission, rectangle
 
     if kind == "rectangle":
         return place(rectangle((0.0, 0.0), 0.0), ground, seed, bounds)
@@ -494,26 +571,11 @@ def flight_path(
         return random_mission(_inset(bounds, 100.0), seed)
     if kind == "lawnmower":
         return place(lawnmower((0.0, 0.0, 400.0, 300.0), 75.0), ground, seed, bounds)
-    return waypoints(Path(kind), crs)
-
-
-def waypoints(path: Path, crs: str) -> FloatArray:
-    """(n, 2) waypoints in ``crs`` of the first LineString (or the Points, in order) of a GeoJSON file, RFC 7946."""
-    import geopandas as gpd
-
-    if not path.is_file():
+    if not Path(kind).is_file():
         raise MissingInputError(
-            f"path {str(path)!r}: give {', '.join(PATHS)} or a GeoJSON file with a LineString"
+            f"--path {kind}: give {', '.join(PATHS)}, or a GeoJSON file with a LineString"
         )
-    try:
-        shapes = gpd.read_file(path).to_crs(crs).geometry
-    except Exception as error:
-        raise InputError(f"{path} cannot be read as GeoJSON: {' '.join(str(error).split())}") from None
-    lines = [g for g in shapes if g.geom_type == "LineString"]
-    points = shapely.get_coordinates(lines[0] if lines else [g for g in shapes if g.geom_type == "Point"])
-    if len(points) < 2:
-        raise InputError(f"{path}: waypoints need a LineString, or two Points or more")
-    return points
+    return path_from_geojson(kind, crs)
 
 
 def _inset(bounds: tuple[float, float, float, float], by: float) -> tuple[float, float, float, float]:
@@ -522,45 +584,117 @@ def _inset(bounds: tuple[float, float, float, float], by: float) -> tuple[float,
     return (left + by, bottom + by, right - by, top - by)
 
 
-def simulate_flight(
-    maps: Maps,
-    out: Path,
-    own: FlightSettings,
-    seed: int,
-    path: str,
-    mode: str,
-    scale_bias: float | None,
-    no_odometry: bool,
-    compass: bool,
-    name: str,
-) -> Path:
-    """Writes a flight folder over built maps; replaces one that stands there."""
-    from brmgeo.synth.flight import Imagery, OdometryErrors, simulate
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """A flight to simulate over built maps; small, so that it travels to a worker.
 
+    Attributes:
+        maps_dir, own: the maps, and the region's camera and flight settings.
+        path: rectangle, lawnmower, random, or a GeoJSON file.
+        mode: masks, frames or both.
+        scale_bias: of the odometry; None draws it.
+        no_odometry, compass: what the aircraft carries.
+        imagery: a (h, w, 3) picture by path in place of the maps' own, for flights on another day; None for the maps'.
+    """
+
+    maps_dir: Path
+    own: FlightSettings
+    path: str = "rectangle"
+    mode: str = "masks"
+    scale_bias: float | None = None
+    no_odometry: bool = False
+    compass: bool = False
+    imagery: Path | None = None
+
+    def imagery_file(self) -> Path | None:
+        """The picture that frames are drawn from; None where none are drawn."""
+        if self.mode == "masks":
+            return None
+        return self.imagery or read_maps(self.maps_dir).imagery
+
+
+def check_simulation(what: Simulation) -> None:
+    """Raises MissingInputError when the maps lack what a simulation needs."""
+    maps = read_maps(what.maps_dir)
     if maps.footprints is None:
         raise MissingInputError(
             f"{maps.folder / 'footprints.gpkg'} is not there; a flight is simulated from the footprints: run brmgeo maps"
         )
-    if mode != "masks" and maps.imagery is None:
+    if what.mode != "masks" and what.imagery_file() is None:
         raise MissingInputError(
             f"{maps.folder / 'imagery.tif'} is not there; frames are drawn from imagery: choose --mode masks"
         )
+
+
+def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
+    """Writes a flight folder over built maps, in place of an earlier one; returns it."""
+    from brmgeo.synth.flight import Imagery, OdometryErrors, simulate
+
+    _may_replace(out, "flight.toml", "a flight")
+    check_simulation(what)
+    maps = read_maps(what.maps_dir)
+    assert maps.footprints is not None
     ground = read_ground(maps.footprints)
-    changes: dict[str, Any] = {"odometry": None if no_odometry else OdometryErrors(scale_bias=scale_bias)}
-    if compass:
+    changes: dict[str, Any] = {
+        "odometry": None if what.no_odometry else OdometryErrors(scale_bias=what.scale_bias)
+    }
+    if what.compass:
         changes["compass_error_deg"] = 3.0
-    settings = simulator_settings(own, **changes)
-    route = flight_path(path, ground, seed, maps.bounds, maps.crs)
-    imagery = None
-    if mode != "masks" and maps.imagery is not None:
-        imagery = Imagery(
-            np.moveaxis(read_window(maps.imagery), 0, -1),
-            maps.ground.left,
-            maps.ground.top,
-            maps.ground.gsd_m,
-        )
+    settings = simulator_settings(what.own, **changes)
+    route = flight_path(what.path, ground, seed, maps.bounds, maps.crs)
+    file, imagery = what.imagery_file(), None
+    if file is not None:
+        box = box_of(file)
+        left, _, _, top = bounds_of(box)
+        imagery = Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
     with _whole_folder(out) as scratch:
-        simulate(scratch, ground, route, maps.crs, settings, seed, mode=mode, imagery=imagery, name=name)  # type: ignore[arg-type]
+        simulate(
+            scratch,
+            ground,
+            route,
+            maps.crs,
+            settings,
+            seed,
+            mode=what.mode,  # type: ignore[arg-type]
+            imagery=imagery,
+            name=name,
+        )
+    return out
+
+
+def _simulate_one(job: tuple[Simulation, int, Path, str]) -> Path:
+    return simulate_flight(*job)
+
+
+def simulate_flights(
+    what: Simulation, jobs: Sequence[tuple[int, Path, str]], scheduler_spec: str | None
+) -> list[Path]:
+    """Many flights, one for each (seed, folder, name), side by side; returns their folders."""
+    check_simulation(what)
+    for _, out, _ in jobs:
+        _may_replace(out, "flight.toml", "a flight")
+    progress = Progress()
+    with scheduler(scheduler_spec, say=progress.say) as map, progress.stage("simulate") as bar:
+        return list(bar.watch(map)(_simulate_one, [(what, *job) for job in jobs]))
+
+
+def other_day(own: Region, maps_dir: Path, season: str, seed: int, out: Path) -> Path:
+    """Writes a generated region's imagery as it is on another day of ``season``, on the maps' lattice; returns ``out``."""
+    from brmgeo.export.cog import write_cog
+    from brmgeo.synth.day import another_day
+    from brmgeo.synth.imagery import render_imagery
+    from brmgeo.synth.town import generate_town
+
+    if own.generate is None:
+        raise SettingsError(
+            f"--season {season}: region {own.name} is not generated, so nobody knows how it looks on another day; "
+            "leave --season out"
+        )
+    assert own.bounds is not None
+    box = box_of(maps_dir / "buildings.tif")
+    town = generate_town(own.bounds, own.generate.seed, crs=own.crs)
+    picture = render_imagery(another_day(town, season, seed), box)  # type: ignore[arg-type]
+    write_cog(out, (picture, np.ones(picture.shape[:2], bool)), box, kind="imagery")
     return out
 
 
@@ -749,7 +883,7 @@ def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
     note = out / ".recipe.json"
     if not note.is_file() or note.read_text(encoding="utf-8") != recipe:
         Progress().say(f"{name}: simulating the paper's rectangle over {own.name} (seed {seed})")
-        simulate_flight(maps, out, own.flight, seed, "rectangle", mode, None, False, False, name)
+        simulate_flight(Simulation(maps.folder, own.flight, mode=mode), seed, out, name)
         note.write_text(recipe, encoding="utf-8")
     return out
 

@@ -7,6 +7,7 @@ the same flight gives the same bytes.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -105,7 +106,7 @@ def first_candidates_figure(
     with mpl.rc_context(_STYLE):
         figure, axes = _map_axes(background.bounds, 9.0)
         _ground(axes, background, background.bounds, pale=True)
-        _candidates(axes, estimate, 5.0)
+        _candidates(axes, estimate, background.bounds, 220)
         handles = [_dot(CANDIDATE, "o", f"candidates ({estimate.candidate_count:,})")]
         if reference_xy is not None:
             _truth(axes, reference_xy)
@@ -143,13 +144,65 @@ def shrinking_figure(
         for axes, index in zip(grid, chosen, strict=False):
             estimate = estimates[index]
             _ground(axes, background, background.bounds, pale=True)
-            _candidates(axes, estimate, 3.0)
+            _candidates(axes, estimate, background.bounds, 110)
             if reference_xy is not None:
                 _truth(axes, reference_xy[index])
             way = "" if flown_m is None else f", {flown_m[index]:.0f} m flown"
             axes.set_title(
                 f"frame {index + 1}{way}: {estimate.candidate_count:,}, {estimate.status}", fontsize=8
             )
+        return _png(figure)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One frame as the camera and the matcher saw it.
+
+    Attributes:
+        title: what is written above it.
+        picture: (H, W, 3) uint8 RGB of the camera, or None when the flight has masks only.
+        view: (h, w) float32 share of building of the levelled view, nose up.
+        known: (h, w) bool, where the view says something.
+        ground: (h, w) uint8 building map (0, 1, 255 unknown) below the same pixels at the fix, or None without a fix.
+    """
+
+    title: str
+    picture: NDArray[np.uint8] | None
+    view: NDArray[np.float32]
+    known: NDArray[np.bool_]
+    ground: NDArray[np.uint8] | None
+
+
+def seen_figure(frames: Sequence[Seen]) -> bytes:
+    """PNG: one row a frame: the camera's picture, its levelled building mask, and the map at the fix with the mask on it."""
+    with mpl.rc_context(_STYLE):
+        pictures = any(f.picture is not None for f in frames)
+        columns = 2 + pictures
+        figure = Figure(figsize=(3.3 * columns, 2.75 * len(frames)), dpi=110, layout="constrained")
+        grid = figure.subplots(len(frames), columns, squeeze=False)
+        for row, seen in zip(grid, frames, strict=True):
+            for axes in row:
+                axes.set_axis_off()
+            if pictures and seen.picture is not None:
+                row[0].imshow(seen.picture, interpolation="antialiased")
+            mask, ground = row[-2], row[-1]
+            grey = np.where(seen.known, 245 - 153 * seen.view, 205.0).astype(np.uint8)
+            mask.imshow(grey, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
+            row[0].set_title(seen.title, fontsize=8)
+            if seen.ground is None:
+                ground.text(
+                    0.5, 0.5, "no fix", ha="center", va="center", transform=ground.transAxes, color="#5c677d"
+                )
+                continue
+            palette = np.full((256, 3), 245, np.uint8)
+            palette[1], palette[255] = (92, 103, 125), (215, 215, 215)
+            ground.imshow(palette[seen.ground], interpolation="antialiased")
+            if (seen.view >= 0.5).any() and (seen.view < 0.5).any():
+                ground.contour(seen.view, levels=[0.5], colors=[CANDIDATE], linewidths=0.9)
+        heads = ["camera"] * pictures + ["mask, levelled, nose up", "map at the fix, mask in red"]
+        for axes, head in zip(grid[0], heads, strict=True):
+            title = axes.get_title(loc="left")
+            axes.set_title(f"{head}\n{title}" if title else head, fontsize=8)
         return _png(figure)
 
 
@@ -259,17 +312,43 @@ def _frame(points: NDArray[np.float64] | None, bounds: Extent) -> Extent:
     return (low[0] - grow_x, low[1] - grow_y, high[0] + grow_x, high[1] + grow_y)
 
 
-def _candidates(axes: Axes, estimate: Estimate, size: float) -> None:
-    if len(estimate.candidates):
-        mass = estimate.candidate_mass
-        peak = float(mass.max()) if len(mass) else 1.0
-        alpha = np.clip(0.25 + 0.75 * mass / peak, 0.25, 1.0) if peak > 0 else np.full(len(mass), 0.4)
-        colours = np.column_stack([np.tile(to_rgb(CANDIDATE), (len(alpha), 1)), alpha])
-        axes.scatter(estimate.candidates[:, 0], estimate.candidates[:, 1], s=size, color=colours, linewidth=0)
+def _candidates(axes: Axes, estimate: Estimate, bounds: Extent, across: int) -> None:
+    """Candidates as a heat map of ``across`` bins: by mass, over three decades, so that single cells stay visible."""
+    xy, mass = estimate.candidates, estimate.candidate_mass
+    left, bottom, right, top = bounds
+    inside = (xy[:, 0] >= left) & (xy[:, 0] < right) & (xy[:, 1] > bottom) & (xy[:, 1] <= top)
+    xy, mass = xy[inside], mass[inside]
+    if not len(xy):
+        return
+    sampled = estimate.candidate_count > len(estimate.candidates)
+    if sampled:
+        # Only some of them are at hand: bins so fine that most hold none would show the drawing, not the candidates.
+        across = min(across, round(1.6 * math.sqrt(len(xy))))
+    size = max(right - left, top - bottom) / max(across, 8)
+    shape = (math.ceil((top - bottom) / size), math.ceil((right - left) / size))
+    heat = np.zeros(shape)
+    rows = np.minimum(((top - xy[:, 1]) / size).astype(np.int64), shape[0] - 1)
+    np.add.at(heat, (rows, ((xy[:, 0] - left) / size).astype(np.int64)), mass if mass.any() else 1.0)
+    share = heat / heat.max()
+    picture = np.empty((*shape, 4))
+    picture[..., :3] = to_rgb(CANDIDATE)
+    tone = np.clip(1.0 + np.log10(np.maximum(share, 1e-12)) / 3.0, 0.0, 1.0)
+    picture[..., 3] = np.where(heat > 0, 0.2 + 0.75 * tone, 0.0)
+    extent = (left, left + shape[1] * size, top - shape[0] * size, top)
+    axes.imshow(picture, extent=extent, interpolation="bilinear" if sampled else "nearest", zorder=3)
+    heavy = np.argwhere(share > 0.05)
+    if len(heavy) <= 12:
+        # A handful of cells on a map of kilometres would be missed.
+        at = np.column_stack([left + (heavy[:, 1] + 0.5) * size, top - (heavy[:, 0] + 0.5) * size])
+        axes.scatter(
+            at[:, 0], at[:, 1], s=150, facecolor="none", edgecolor=CANDIDATE, linewidth=1.3, zorder=5
+        )
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
 
 
 def _truth(axes: Axes, xy: NDArray[np.float64]) -> None:
-    axes.scatter(xy[0], xy[1], s=90, marker="P", color="#00b4d8", edgecolor="white", linewidth=1.0, zorder=6)
+    axes.scatter(xy[0], xy[1], s=70, marker="P", color="#00b4d8", edgecolor="white", linewidth=1.0, zorder=6)
 
 
 def _dot(colour: str, marker: str, label: str, size: float = 6) -> Line2D:

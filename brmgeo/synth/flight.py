@@ -1028,7 +1028,13 @@ def imu_of(course: Course, seed: int) -> tuple[FloatArray, FloatArray]:
 def _toml(name: str, settings: FlightSettings, reference: str, altimeter: bool) -> str:
     camera, mount = settings.camera, settings.mount
     lens = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    lines = [f"name = {json.dumps(name)}", "[camera]", f"width = {camera.width}", f"height = {camera.height}"]
+    lines = ["# Simulated by brmgeo: no real flight"]
+    lines += [
+        f"name = {json.dumps(name)}",
+        "[camera]",
+        f"width = {camera.width}",
+        f"height = {camera.height}",
+    ]
     lines += [f"{key} = {float(value)!r}" for key, value in lens.items()]
     if camera.is_distorted:
         lines.append(f"distortion = [{', '.join(repr(float(v)) for v in camera.distortion)}]")
