@@ -177,7 +177,7 @@ class GridMatcher(ABC):
         known = self.belief.rest > 1e-3
         # Flying where the map does not reach must not cost a search each frame.
         if known and (
-            self._unfixed_searches < 15 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)
+            self._unfixed_searches < 10 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)
         ):
             wanted = np.ones(self.belief.headings, np.bool_)
             score = self._score_all(view, yaw if yaw is not None else 0.0, wanted)
