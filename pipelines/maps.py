@@ -174,7 +174,7 @@ def run_lattice(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     if box.shape[0] * box.shape[1] > MAX_PIXELS:
         raise SettingsError(
             f"the region spans {(frame[2] - frame[0]) / 1000:.0f} x {(frame[3] - frame[1]) / 1000:.0f} km by its {basis}, "
-            f"{box.shape[1]} x {box.shape[0]} px: too many; state its bounds or a larger GSD, or look for stray outlines"
+            f"{box.shape[1]} x {box.shape[0]} px: too many; state smaller bounds or a larger GSD, or look for stray outlines"
         )
     area = float(shapely.union_all([p for _, p in known]).intersection(shapely.box(*bounds_of(box))).area)
     if area == 0.0:
@@ -466,6 +466,11 @@ def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = Fals
     Raises MissingInputError (which files or tiles, where they go, where to get them).
     """
     require_projected_metres(region.crs)
+    for number in region.sheets:
+        if not is_sheet_number(number):
+            raise SettingsError(
+                f"region {region.name}: sheets: {number!r} is not an NGII sheet number of 5 to 9 digits, such as 36914093"
+            )
     widest = max(region.ratio.radii())
     if widest > MAX_RADIUS_PX * region.gsd_m:
         raise SettingsError(
@@ -862,6 +867,7 @@ def region_of_files(
     radii_m: Sequence[float] | None,
     layer: str | None,
     encoding: str | None,
+    source_crs: str | None,
     repairs: bool,
 ) -> Region:
     """A region without a region file, for ``brmgeo maps --footprints``; raises MissingInputError for absent files."""
@@ -869,11 +875,6 @@ def region_of_files(
         if not path.exists():
             raise MissingInputError(f"maps --footprints: {path} is not there; correct the path")
     numbers = tuple(s.strip() for s in sheets.split(",") if s.strip()) if sheets else ()
-    for number in numbers:
-        if not is_sheet_number(number):
-            raise SettingsError(
-                f"--sheets: {number!r} is not an NGII sheet number of 5 to 9 digits, such as 36914093"
-            )
     files = dict.fromkeys(p.absolute() for path in footprints for p in _files_of(path))
     name = out.absolute().name
     asked: dict[str, Any] = {
@@ -887,6 +888,7 @@ def region_of_files(
             "paths": tuple(glob.escape(str(p)) for p in files),
             "layer": layer,
             "encoding": encoding,
+            "crs": source_crs,
             "repairs_layer": repairs,
         },
         "imagery": None if imagery is None else {"kind": "raster", "path": str(imagery.absolute())},

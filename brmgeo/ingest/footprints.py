@@ -322,7 +322,8 @@ def _from_vector(
     if native is None:
         beside = f" (no {path.stem}.prj beside it)" if path.suffix.lower() == ".shp" else ""
         raise CrsError(
-            f"{path.name}: the file does not say its CRS{beside}: give it, such as --crs EPSG:5187"
+            f"{path.name}: the file does not say its CRS{beside}: give it, such as --source-crs EPSG:5187 (in a region "
+            'file: crs = "EPSG:5187" under [footprints])'
         )
     target = crs or crs_name(native)
     require_projected_metres(target)

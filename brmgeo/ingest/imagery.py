@@ -280,7 +280,9 @@ def _plane_of(source: ImagerySource) -> Iterator[_Plane]:
         try:
             src = rasterio.open(path)
         except (RasterioError, CPLE_BaseError) as error:
-            raise InputError(f"{path} is not a readable image: {_one_line(error)}") from error
+            raise InputError(
+                f"{path} is not a readable image ({_one_line(error)}); fetch or export it again"
+            ) from error
     with src:
         placed = not src.transform.is_identity
         if isinstance(source, NgiiOrtho):

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import pytest
-from pipelines.cli import cli, run
 from small_maps import SmallRegion, make_source
+
+from pipelines.cli import cli, run
 
 
 @pytest.fixture(autouse=True)

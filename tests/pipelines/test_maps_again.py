@@ -11,8 +11,9 @@ import time
 from pathlib import Path
 
 import pytest
-from pipelines import maps
 from small_maps import SHEETS, SmallRegion, brmgeo, rasters_of
+
+from pipelines import maps
 
 STAGES = (
     *(f"outlines {s}" for s in SHEETS),

@@ -201,7 +201,7 @@ def test_imagery_of_another_place(region: SmallRegion, maps: Callable[[], Answer
         ("[40.0, 17.3]", "[40.0, -1.0]", ("radii_m",)),
         ("[40.0, 17.3]", "[40.0, nan]", ("radii_m",)),
         ("[40.0, 17.3]", "[40.0, 1e9]", ("radius",)),
-        (f"'{FIRST}'", '"99999999"', ("99999999",)),
+        (f"'{FIRST}'", '"99999999"', ("99999999", "not an NGII sheet")),
     ],
 )
 def test_faulty_region_files(
@@ -308,8 +308,22 @@ def shapefile(tmp_path: Path) -> Path:
 def test_shapefile_without_prj(shapefile: Path, capsys: Capture, tmp_path: Path) -> None:
     shapefile.with_suffix(".prj").unlink()
     said = brmgeo(capsys, "maps", "--footprints", shapefile, "--crs", CRS, "--out", tmp_path / "out")
-    says(said, "buildings.shp", ".prj", "CRS")
+    says(said, "buildings.shp", ".prj", "CRS", "--source-crs")
     assert not (tmp_path / "out" / "buildings.tif").exists()
+    words = (
+        "maps",
+        "--footprints",
+        shapefile,
+        "--crs",
+        "EPSG:5186",
+        "--source-crs",
+        CRS,
+        "--out",
+        tmp_path / "out",
+    )
+    assert brmgeo(capsys, *words).status == 0
+    with rasterio.open(tmp_path / "out" / "buildings.tif") as src:
+        assert (src.read(1) == 1).sum() * 0.25 == pytest.approx(30 * 20 + 20 * 30, rel=0.05)
 
 
 def test_shapefile_without_shx_is_read_and_left_alone(
