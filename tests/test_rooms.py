@@ -9,18 +9,27 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-VALUES = {"brmgeo.errors", "brmgeo.region", "brmgeo.geo", "brmgeo.flight.values", "brmgeo.flight.readings"}
+VALUES = {
+    "brmgeo.errors",
+    "brmgeo.region",
+    "brmgeo.geo",
+    "brmgeo.flight.values",
+    "brmgeo.flight.readings",
+    "brmgeo.flight.frames",
+}
 KERNELS = {
     "brmgeo.maps.ratio",
     "brmgeo.match",
     "brmgeo.flight.camera",
     "brmgeo.flight.view",
     "brmgeo.flight.motion",
+    "brmgeo.flight.checks",
 }
 ADAPTERS = {
     "brmgeo.ingest",
     "brmgeo.export",
     "brmgeo.flight.folder",
+    "brmgeo.flight.logs",
     "brmgeo.flight.odometry",
     "brmgeo.flight.tables",
 }
@@ -45,6 +54,9 @@ ONLY_IN = {
     "distributed": {"brmgeo.workflow"},
     "torch": {"brmgeo.segment"},
     "httpx": {"brmgeo.ingest"},
+    "rosbags": {"brmgeo.flight.logs"},
+    "pyulog": {"brmgeo.flight.logs"},
+    "pymavlink": {"brmgeo.flight.logs"},
 }
 FORBIDDEN_IN_KERNELS = {"pathlib", "rasterio", "pyproj", "geopandas", "pyogrio", "logging"}
 

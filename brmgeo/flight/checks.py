@@ -40,7 +40,11 @@ def _resampled(t_s: FloatArray, values: FloatArray, at_s: FloatArray, width_s: f
 
 
 def clock_lag_s(
-    first_t_s: FloatArray, first: FloatArray, second_t_s: FloatArray, second: FloatArray, max_lag_s: float = 2.0
+    first_t_s: FloatArray,
+    first: FloatArray,
+    second_t_s: FloatArray,
+    second: FloatArray,
+    max_lag_s: float = 2.0,
 ) -> tuple[float, float] | None:
     """How much later the second stream's stamps are than the first's for the same turns, and their correlation.
 
@@ -122,7 +126,9 @@ def flat_axis(xyz_m: FloatArray) -> int | None:
     return int(np.ptp(xyz_m, axis=0).argmin())
 
 
-def agreement_m(first: Odometry, second: Odometry, *, scale: bool = False) -> tuple[float, float, float] | None:
+def agreement_m(
+    first: Odometry, second: Odometry, *, scale: bool = False
+) -> tuple[float, float, float] | None:
     """How well two tracks of one flight fit: RMS distance in metres after the best rotation and shift, the scale, seconds.
 
     Args:

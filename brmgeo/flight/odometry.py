@@ -81,7 +81,7 @@ def _finish(
 ) -> Odometry:
     # Some writers tell a pose again when they have corrected it (V102 of EuRoC's VINS): the later word counts.
     repeats = np.flatnonzero(np.diff(t) == 0.0)
-    for i in repeats:
+    for i in repeats.tolist():
         apart = float(np.linalg.norm(xyz[i + 1] - xyz[i]))
         if apart > REPEAT_M:
             raise refuse(

@@ -124,12 +124,16 @@ def test_faulty_files_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("separator", [",", " "])
 @pytest.mark.parametrize("seconds", [True, False])
 @pytest.mark.parametrize("order", ["wxyz", "xyzw"])
-def test_vins_dialects_and_their_wrong_order(tmp_path: Path, separator: str, seconds: bool, order: str) -> None:
+def test_vins_dialects_and_their_wrong_order(
+    tmp_path: Path, separator: str, seconds: bool, order: str
+) -> None:
     path = tmp_path / "vio.csv"
     columns = XYZW if order == "xyzw" else XYZW[:, [3, 0, 1, 2]]
     path.write_text(
         "\n".join(
-            separator.join([f"{t:.9f}" if seconds else f"{round(t * 10)}00000000", *(f"{v:.9f}" for v in [*p, *q])])
+            separator.join(
+                [f"{t:.9f}" if seconds else f"{round(t * 10)}00000000", *(f"{v:.9f}" for v in [*p, *q])]
+            )
             for t, p, q in zip(T, XYZ, columns)
         )
     )

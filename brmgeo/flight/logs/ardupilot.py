@@ -288,7 +288,9 @@ def _telemetry(path: Path, options: LogOptions) -> Log:
     elif "ATTITUDE_QUATERNION" in found:
         rows = _rows(found["ATTITUDE_QUATERNION"], lambda m: [time(m), m.q1, m.q2, m.q3, m.q4])
         attitude = Orientation(rows[:, 0], enu_flu_from_ned_frd(rows[:, 1:5]), True, "ATTITUDE_QUATERNION")
-    counts = {n: len(found[n]) for n in ("VISION_POSITION_ESTIMATE", "LOCAL_POSITION_NED") if n in found}
+    counts: dict[str, int] = {
+        n: len(found[n]) for n in ("VISION_POSITION_ESTIMATE", "LOCAL_POSITION_NED") if n in found
+    }
     if attitude is None:
         counts.pop("LOCAL_POSITION_NED", None)
     stream = choose(path, "odometry", "--topic", options.topic, counts, any_topic=True)

@@ -384,7 +384,7 @@ def _lists(folder: Path, photos: list[_Photo], notes: list[str]) -> None:
             }
             if not (abs(values["lat"]) <= 90.0 and abs(values["lon"]) <= 180.0):
                 raise FlightError(
-                    f"{path}:{number}: ({row[where['lon']]}, {row[where['lat']]}) is no longitude, latitude: check the header"
+                    f"{path}:{number}: ({row[where['lon']]}, {row[where['lat']]}) is no place: check the header"
                 )
             photo.lat, photo.lon = values["lat"], values["lon"]
             photo.alt = values.get("alt", photo.alt)

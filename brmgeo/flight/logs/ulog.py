@@ -75,10 +75,13 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
     found = {name: len(sets[name]["timestamp"]) for name in _STREAMS if name in sets and _usable(name, sets)}
     # Several are the rule, and they are one estimator's words: the first in order of worth is the choice.
     stream = choose(path, "odometry", "--topic", options.topic, found, any_topic=True)
-    odometry, resets = None, []
-    faults = []
+    odometry: Odometry | None = None
+    resets: list[tuple[float, str]] = []
+    faults: list[str] = []
     if stream is None and "vehicle_local_position" in sets:
-        faults.append("vehicle_local_position is there, but the autopilot never held its horizontal position valid")
+        faults.append(
+            "vehicle_local_position is there, but the autopilot never held its horizontal position valid"
+        )
     if stream == "vehicle_local_position":
         odometry, resets = _local_position(path, sets, notes)
     elif stream is not None:
