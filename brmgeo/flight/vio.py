@@ -1,0 +1,664 @@
+"""Visual-inertial odometry over ground: an error-state Kalman filter on tracked points, IMU and height above ground.
+
+The camera looks at a plane whose distance the altimeter gives; that distance is the scale. The filter's state is
+attitude, velocity, position, the biases of gyro and accelerometer, the delay between camera and IMU, the camera's
+boresight error, and a copy of position and attitude at the last keyframe. Each tracked point ties the present pose to
+the keyframe's: its ray from the keyframe meets the plane, and the present camera must see it there.
+
+Buildings break the plane. Every point's height above it is estimated from its own parallax since it was first seen;
+the ground is the slowest layer, the lowest well-filled one, and points clearly above it are left out.
+
+Sources: error-state filter: Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), in its
+global-error form; cloned keyframe: Roumeliotis & Burdick, "Stochastic cloning" (ICRA 2002); delay as a state: Li &
+Mourikis, "Online temporal calibration for camera-IMU systems" (IJRR 2014); the plane's homography as measurement:
+Bloesch et al., "Fusion of optical flow and inertial measurements for robust egomotion estimation" (IROS 2014).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from brmgeo.flight.camera import pixel_from_ray, ray_from_pixel
+from brmgeo.flight.klt import KltSettings, KltTracker
+from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu, Odometry
+
+GRAVITY = 9.80665
+# Error state: where each part begins. The clone (position, attitude) is last.
+P, V, TH, BG, BA, TD, BS, CP, CT, SIZE = 0, 3, 6, 9, 12, 15, 16, 19, 22, 25
+
+
+@dataclass(frozen=True, slots=True)
+class VioSettings:
+    """Noise and thresholds; the defaults are a consumer IMU and a laser or radar altimeter.
+
+    Attributes:
+        gyro_noise, accel_noise: densities, rad/s and m/s2 per root Hz, somewhat above the data sheet's.
+        gyro_walk, accel_walk: random walk of the biases, rad/s and m/s2 per root second.
+        gyro_bias_sigma, accel_bias_sigma: of the biases at the start.
+        speed_sigma_m_s, tilt_sigma_rad: of velocity and levelling at the start.
+        agl_sigma_m: of one height reading.
+        ground_walk_m_sqrt_s: how the ground below rises and falls, metres per root second.
+        pixel_sigma: of one tracked point, pixels, at ten frames a second.
+        unevenness_m: of the ground itself about its plane.
+        delay_sigma_s, boresight_sigma_rad: of camera-IMU delay and mounting at the start; 0 holds them at zero.
+        slowest_layer: tell roofs from ground; False treats all points as ground.
+        keyframe_share: a new keyframe is taken after this share of the height has been flown.
+        min_tracks: with fewer points common with the keyframe a frame is blind.
+        layer_m: points higher than this above the ground layer (and two sigma) are left out.
+        max_gap_s: after a longer pause between frames nothing is tracked across.
+    """
+
+    gyro_noise: float = math.radians(0.01)
+    accel_noise: float = 0.01
+    gyro_walk: float = math.radians(0.002)
+    accel_walk: float = 0.0005
+    gyro_bias_sigma: float = math.radians(0.5)
+    accel_bias_sigma: float = 0.05
+    speed_sigma_m_s: float = 15.0
+    tilt_sigma_rad: float = math.radians(3.0)
+    agl_sigma_m: float = 1.0
+    ground_walk_m_sqrt_s: float = 0.1
+    pixel_sigma: float = 1.0
+    unevenness_m: float = 0.7
+    delay_sigma_s: float = 0.05
+    boresight_sigma_rad: float = math.radians(0.7)
+    slowest_layer: bool = True
+    keyframe_share: float = 0.3
+    min_tracks: int = 15
+    layer_m: float = 2.0
+    max_gap_s: float = 1.5
+    klt: KltSettings = field(default_factory=KltSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class VioResult:
+    """What the filter made of a flight, one row a frame.
+
+    Attributes:
+        odometry: poses of the body, z above ground; gravity-aligned, yaw 0 and x = y = 0 at the first frame. Its
+            ``segment`` grows where the track was lost for good.
+        walk_m2: (n,) variance per axis that the steps have gathered since the first frame, without heading and scale:
+            the variance of a step between two frames is the difference.
+        yaw_sigma_rad: (n,) of the yaw against the first frame's.
+        tracks: (n,) points that tied the frame to its keyframe.
+        blind: (n,) bool: bridged by the IMU alone.
+        velocity_m_s: (n, 3) in the odometry frame.
+        delay_s, delay_sigma_s: IMU time minus camera time, and its standard deviation.
+        boresight_rad: (3,) rotation vector of the camera in the body frame on top of the stated mount, and sigma (3,).
+        gyro_bias_rad_s, accel_bias_m_s2: (3,) at the end.
+        high_share: mean share of points that were told to be above ground.
+    """
+
+    odometry: Odometry
+    walk_m2: FloatArray
+    yaw_sigma_rad: FloatArray
+    tracks: NDArray[np.int64]
+    blind: NDArray[np.bool_]
+    velocity_m_s: FloatArray
+    delay_s: float
+    delay_sigma_s: float
+    boresight_rad: FloatArray
+    boresight_sigma_rad: FloatArray
+    gyro_bias_rad_s: FloatArray
+    accel_bias_m_s2: FloatArray
+    high_share: float
+
+
+# ---------------------------------------------------------------- kernels
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _skew(v: Any) -> Any:
+    out = np.zeros((3, 3))
+    out[0, 1], out[0, 2] = -v[2], v[1]
+    out[1, 0], out[1, 2] = v[2], -v[0]
+    out[2, 0], out[2, 1] = -v[1], v[0]
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _exp(v: Any) -> Any:
+    # Rodrigues' rotation of a rotation vector.
+    angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    k = _skew(v)
+    if angle < 1e-9:
+        return np.eye(3) + k
+    return np.eye(3) + math.sin(angle) / angle * k + (1.0 - math.cos(angle)) / (angle * angle) * (k @ k)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _propagate(p, v, rot, bg, ba, t0, t1, it, gyro, accel, qg, qa, qbg, qba, qz):  # type: ignore[no-untyped-def]
+    # The nominal state from t0 to t1 through the IMU samples, with the transition (15, 15) and noise (15, 15) of its
+    # error. Between samples the readings are linear; before the first and after the last they are held.
+    phi = np.eye(15)
+    noise = np.zeros((15, 15))
+    omega = np.zeros(3)
+    n = it.shape[0]
+    t = t0
+    i = np.searchsorted(it, t0, side="right") - 1
+    while t < t1 - 1e-9:
+        nxt = t1
+        if i + 1 < n and it[i + 1] < t1:
+            nxt = it[i + 1]
+        dt = nxt - t
+        if dt > 0.0:
+            if i < 0:
+                g, a = gyro[0], accel[0]
+            elif i + 1 >= n:
+                g, a = gyro[n - 1], accel[n - 1]
+            else:
+                share = (0.5 * (t + nxt) - it[i]) / (it[i + 1] - it[i])
+                g = gyro[i] + share * (gyro[i + 1] - gyro[i])
+                a = accel[i] + share * (accel[i + 1] - accel[i])
+            omega = g - bg
+            half = rot @ _exp(omega * (0.5 * dt))
+            f = half @ (a - ba)
+            acc = f.copy()
+            acc[2] -= 9.80665
+            p = p + v * dt + 0.5 * acc * dt * dt
+            v = v + acc * dt
+            rot = rot @ _exp(omega * dt)
+            step = np.eye(15)
+            turn = -_skew(f)
+            for r in range(3):
+                step[r, 3 + r] = dt
+                for c in range(3):
+                    step[r, 6 + c] = 0.5 * dt * dt * turn[r, c]
+                    step[3 + r, 6 + c] = dt * turn[r, c]
+                    step[r, 12 + c] = -0.5 * dt * dt * half[r, c]
+                    step[3 + r, 12 + c] = -dt * half[r, c]
+                    step[6 + r, 9 + c] = -dt * half[r, c]
+            phi = step @ phi
+            noise = step @ noise @ step.T
+            # A reading that had to be held or stretched over a gap is worth less the longer that is.
+            worse = 1.0 + (dt / 0.1) ** 2 * 100.0 if dt > 0.1 else 1.0
+            for r in range(3):
+                noise[3 + r, 3 + r] += qa * dt * worse
+                noise[6 + r, 6 + r] += qg * dt * worse
+                noise[9 + r, 9 + r] += qbg * dt
+                noise[12 + r, 12 + r] += qba * dt
+            noise[2, 2] += qz * dt
+        t = nxt
+        i += 1
+    return p, v, rot, phi, noise, omega
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _tie(p, rot, pk, rotk, rbc, vel, omega, rays, seen, weight, matrix, vector):  # type: ignore[no-untyped-def]
+    # Residuals (n, 2) of normalised image coordinates, observed minus predicted; where weight is positive, J'WJ is
+    # added to matrix and J'Wr to vector. pk, rotk: the keyframe's body pose; rbc: body_from_camera.
+    n = rays.shape[0]
+    out = np.zeros((n, 2))
+    cam = rot @ rbc
+    camk = rotk @ rbc
+    inv = cam.T.copy()
+    turn_rate = rot @ omega
+    jac = np.zeros((2, 25))
+    dy = np.zeros((3, 25))
+    for j in range(n):
+        w = camk @ rays[j]
+        if w[2] > -1e-3:
+            out[j, 0] = out[j, 1] = np.nan
+            continue
+        lam = -pk[2] / w[2]
+        d = pk + lam * w - p
+        y = inv @ d
+        if y[2] < 1e-3:
+            out[j, 0] = out[j, 1] = np.nan
+            continue
+        out[j, 0] = seen[j, 0] - y[0] / y[2]
+        out[j, 1] = seen[j, 1] - y[1] / y[2]
+        if weight[j] <= 0.0:
+            continue
+        plane = np.eye(3)
+        for r in range(3):
+            plane[r, 2] -= w[r] / w[2]
+        dx = inv @ plane  # change of y with the keyframe's position
+        dy[:, :] = 0.0
+        a_theta = inv @ _skew(d)
+        a_clone = -lam * (dx @ _skew(w))
+        in_body = rbc @ rays[j]
+        a_bore = rbc.T @ _skew(rot.T @ d) - lam * (dx @ (rotk @ _skew(in_body)))
+        a_delay = a_theta @ turn_rate - inv @ vel
+        for r in range(3):
+            for c in range(3):
+                dy[r, c] = -inv[r, c]
+                dy[r, 6 + c] = a_theta[r, c]
+                dy[r, 16 + c] = a_bore[r, c]
+                dy[r, 19 + c] = dx[r, c]
+                dy[r, 22 + c] = a_clone[r, c]
+            dy[r, 15] = a_delay[r]
+        for c in range(25):
+            jac[0, c] = (dy[0, c] - y[0] / y[2] * dy[2, c]) / y[2]
+            jac[1, c] = (dy[1, c] - y[1] / y[2] * dy[2, c]) / y[2]
+        for a in range(25):
+            for b in range(a, 25):
+                s = weight[j] * (jac[0, a] * jac[0, b] + jac[1, a] * jac[1, b])
+                matrix[a, b] += s
+                if a != b:
+                    matrix[b, a] += s
+            vector[a] += weight[j] * (jac[0, a] * out[j, 0] + jac[1, a] * out[j, 1])
+    return out
+
+
+def ground_layer(height_m: FloatArray, sigma_m: FloatArray, least_share: float = 0.35) -> float | None:
+    """Height of the slowest layer: the lowest peak of the density of heights that is not much below the highest one.
+
+    Args:
+        height_m: (n,) heights of points from their parallax, metres.
+        sigma_m: (n,) their standard deviations.
+        least_share: a peak counts when the density there is this share of the greatest density.
+
+    None when there are fewer than eight points. Points on the ground all move alike and slowest; roofs move faster, each
+    at its own height, so the ground is the lowest crowd, not the biggest.
+    """
+    if len(height_m) < 8:
+        return None
+    width = np.maximum(sigma_m, 0.7)
+    low, high = np.percentile(height_m, [1.0, 99.0])
+    at = np.arange(low - 3.0, min(high, low + 150.0) + 3.5, 0.5)
+    density = (np.exp(-0.5 * ((at[:, None] - height_m) / width) ** 2) / width).sum(axis=1)
+    inner = density[1:-1]
+    peak = (inner >= density[:-2]) & (inner > density[2:]) & (inner >= least_share * density.max())
+    where = np.flatnonzero(peak)
+    return float(at[1 + where[0]]) if where.size else float(at[int(density.argmax())])
+
+
+# ---------------------------------------------------------------- the filter
+
+
+class _Points:
+    """What the filter knows of each tracked point, row by row with the tracker's."""
+
+    def __init__(self) -> None:
+        self.key_ray: FloatArray = np.empty((0, 3))  # in the keyframe's camera; NaN when not seen there
+        self.first_level: FloatArray = np.empty((0, 2))  # x / depth, y / depth in level axes where first seen
+        self.first_place: FloatArray = np.empty((0, 3))
+        self.height: FloatArray = np.empty(0)
+        self.sigma: FloatArray = np.empty(0)  # inf until there is parallax
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        for name in vars(self):
+            setattr(self, name, getattr(self, name)[chosen])
+
+    def add(self, level: FloatArray, place: FloatArray) -> None:
+        n = len(level)
+        self.key_ray = np.concatenate([self.key_ray, np.full((n, 3), np.nan)])
+        self.first_level = np.concatenate([self.first_level, level])
+        self.first_place = np.concatenate([self.first_place, np.repeat(place[None], n, axis=0)])
+        self.height = np.concatenate([self.height, np.zeros(n)])
+        self.sigma = np.concatenate([self.sigma, np.full(n, np.inf)])
+
+
+class VioFilter:
+    """The filter, frame by frame: ``start`` once, then ``frame`` for each image in order of time."""
+
+    def __init__(
+        self, camera: Camera, mount: Attitude, imu: Imu, settings: VioSettings | None = None
+    ) -> None:
+        self.camera, self.imu = camera, imu
+        self.settings = s = settings or VioSettings()
+        self.focal = 0.5 * (camera.fx + camera.fy)
+        self.tracker = KltTracker(s.klt)
+        self.points = _Points()
+        self.rbc = mount.body_from_camera()
+        self.delay = 0.0
+        self.bore = np.zeros(3)
+        self.gyro_bias, self.accel_bias = np.zeros(3), np.zeros(3)
+        self.omega = np.zeros(3)
+        self.walk = 0.0
+        self._walk_key = 0.0
+        self._segment = 0
+        self._since_layer = 0
+        self._layer: float | None = None
+        self._interval = 0.1
+        self._last_t = -math.inf
+        self._seen_again = False
+        self._started = False
+        self._anchor: tuple[FloatArray, FloatArray] | None = None
+
+    def start(self, t_s: float, agl_m: float) -> None:
+        """Level by the accelerometer's mean over half a second about ``t_s``; height from the altimeter."""
+        s = self.settings
+        near = np.abs(self.imu.t_s - t_s) <= 0.5
+        if not near.any():
+            near = np.zeros(len(near), dtype=bool)
+            near[int(np.abs(self.imu.t_s - t_s).argmin())] = True
+        up = self.imu.accel_m_s2[near].mean(axis=0)
+        roll = math.atan2(up[1], up[2])
+        pitch = math.atan2(-up[0], math.hypot(up[1], up[2]))
+        self.t = t_s
+        self.p = np.array([0.0, 0.0, agl_m])
+        self.v = np.zeros(3)
+        self.rot = Attitude(roll, pitch).matrix()
+        sigma = np.zeros(SIZE)
+        sigma[P + 2] = s.agl_sigma_m
+        sigma[V : V + 3] = s.speed_sigma_m_s, s.speed_sigma_m_s, 3.0
+        sigma[TH : TH + 2] = s.tilt_sigma_rad
+        sigma[BG : BG + 3], sigma[BA : BA + 3] = s.gyro_bias_sigma, s.accel_bias_sigma
+        sigma[TD], sigma[BS : BS + 3] = s.delay_sigma_s, s.boresight_sigma_rad
+        self.cov = np.diag(sigma**2)
+        self._started = True
+        self._clone()
+
+    def frame(self, t_s: float, grey: NDArray[np.uint8], agl_m: float) -> tuple[int, bool]:
+        """Take in one image (h, w) uint8 and a height; the number of points used, and whether the frame was blind."""
+        s = self.settings
+        if not self._started:
+            self.start(t_s, agl_m)
+        gap = t_s - self._last_t
+        if math.isfinite(gap):
+            self._interval += 0.1 * (min(gap, 1.0) - self._interval)
+        self._last_t = t_s
+        self._advance(t_s + self.delay)
+        self._see_height(agl_m)
+        if gap > s.max_gap_s:
+            self.tracker.forget()
+            self.points.keep(np.zeros(len(self.points.sigma), dtype=bool))
+        alive = self.tracker.step(grey, self._expected())
+        self.points.keep(alive)
+        rays = ray_from_pixel(self.camera, self.tracker.px)
+        self._estimate_heights(rays)
+        used = self._update(rays)
+        blind = used < s.min_tracks and len(self.points.sigma) + used >= 0 and bool(math.isfinite(gap))
+        if self.tracker.wants_anchor or blind:
+            self._drop_strays(rays)
+            rays = ray_from_pixel(self.camera, self.tracker.px)
+            new = self.tracker.refill()
+            if new:
+                fresh = ray_from_pixel(self.camera, self.tracker.px[-new:])
+                rays = np.concatenate([rays, fresh])
+                self.points.add(self._level(fresh), self.p)
+            self._anchor = (self.p.copy(), self.rot @ self.camera_mount)
+            common = int(np.isfinite(self.points.key_ray[:, 0]).sum())
+            flown = math.hypot(*(self.p - self.pk)[:2])
+            if blind or common < 0.5 * len(rays) or flown > s.keyframe_share * self.p[2]:
+                self._clone()
+                self.points.key_ray = rays.copy()
+        return used, blind
+
+    @property
+    def camera_mount(self) -> FloatArray:
+        """(3, 3) body_from_camera with the boresight estimated so far."""
+        return np.asarray(_exp(self.bore) @ self.rbc)
+
+    def step_variance(self) -> float:
+        """Variance per axis gathered since the start, square metres, heading left out."""
+        # Position against the keyframe, in axes that turn with the keyframe's heading.
+        d = self.p - self.pk
+        jac = np.zeros((2, SIZE))
+        jac[:, P : P + 2] = np.eye(2)
+        jac[:, CP : CP + 2] = -np.eye(2)
+        jac[:, CT + 2] = d[1], -d[0]
+        return self._walk_key + float(np.trace(jac @ self.cov @ jac.T)) / 2.0
+
+    def _clone(self) -> None:
+        if hasattr(self, "pk"):
+            self._walk_key = self.step_variance()
+        self.pk, self.rk = self.p.copy(), self.rot.copy()
+        self.vk = self.v.copy()
+        select = np.zeros((SIZE, SIZE))
+        select[:CP, :CP] = np.eye(CP)
+        select[CP : CP + 3, P : P + 3] = np.eye(3)
+        select[CT : CT + 3, TH : TH + 3] = np.eye(3)
+        # The image was taken at a time that is known up to the delay's error.
+        select[CP : CP + 3, TD] = self.v
+        select[CT : CT + 3, TD] = self.rot @ self.omega
+        self.cov = select @ self.cov @ select.T
+
+    def _advance(self, t: float) -> None:
+        s = self.settings
+        if t <= self.t:
+            return
+        imu = self.imu
+        self.p, self.v, self.rot, phi, noise, self.omega = _propagate(
+            self.p,
+            self.v,
+            self.rot,
+            self.gyro_bias,
+            self.accel_bias,
+            self.t,
+            t,
+            imu.t_s,
+            imu.gyro_rad_s,
+            imu.accel_m_s2,
+            s.gyro_noise**2,
+            s.accel_noise**2,
+            s.gyro_walk**2,
+            s.accel_walk**2,
+            s.ground_walk_m_sqrt_s**2,
+        )
+        c = self.cov
+        top = phi @ c[:15, 15:]
+        c[:15, :15] = phi @ c[:15, :15] @ phi.T + noise
+        c[:15, 15:] = top
+        c[15:, :15] = top.T
+        self.t = t
+
+    def _correct(self, dx: FloatArray) -> None:
+        self.p = self.p + dx[P : P + 3]
+        self.v = self.v + dx[V : V + 3]
+        self.rot = np.asarray(_exp(dx[TH : TH + 3]) @ self.rot)
+        self.gyro_bias = self.gyro_bias + dx[BG : BG + 3]
+        self.accel_bias = self.accel_bias + dx[BA : BA + 3]
+        self.delay += float(dx[TD])
+        self.bore = Rotation.from_matrix(_exp(dx[BS : BS + 3]) @ _exp(self.bore)).as_rotvec()
+        self.pk = self.pk + dx[CP : CP + 3]
+        self.rk = np.asarray(_exp(dx[CT : CT + 3]) @ self.rk)
+
+    def _see_height(self, agl_m: float) -> None:
+        # One reading, its weight lowered where it jumps: an altimeter over a roof.
+        column = self.cov[:, P + 2]
+        innovation = agl_m - self.p[2]
+        # Readings come with every frame but err together: ten a second count as one a second or two.
+        noise = self.settings.agl_sigma_m**2 * max(1.0, 0.5 / max(self._interval, 0.02))
+        limit = 3.0 * math.sqrt(float(column[P + 2]) + self.settings.agl_sigma_m**2)
+        noise *= max(1.0, abs(innovation) / limit) ** 2
+        total = float(column[P + 2]) + noise
+        gain = column / total
+        self.cov = self.cov - np.outer(gain, column)
+        self._correct(gain * innovation)
+
+    def _level(self, rays: FloatArray) -> FloatArray:
+        # (n, 2) where rays meet a plane one metre below, in the odometry frame's axes.
+        world = rays @ (self.rot @ self.camera_mount).T
+        return np.asarray(world[:, :2] / np.maximum(-world[:, 2:3], 1e-3))
+
+    def _expected(self) -> FloatArray | None:
+        # Where the points should be now, by the poses at the anchor and now.
+        if self._anchor is None or not len(self.tracker.px):
+            return None
+        place, cam = self._anchor
+        world = ray_from_pixel(self.camera, self.tracker.anchor_px) @ cam.T
+        height = np.where(np.isfinite(self.points.sigma), self.points.height, 0.0)
+        reach = (place[2] - height) / np.maximum(-world[:, 2], 1e-3)
+        now = (place + world * reach[:, None] - self.p) @ (self.rot @ self.camera_mount)
+        return pixel_from_ray(self.camera, now)
+
+    def _estimate_heights(self, rays: FloatArray) -> None:
+        pts = self.points
+        if not self.settings.slowest_layer or not len(pts.sigma):
+            return
+        level = self._level(rays)
+        moved = pts.first_level - level
+        length2 = (moved**2).sum(axis=1)
+        d = self.p - pts.first_place
+        excess = pts.first_place[:, 2:3] * pts.first_level - self.p[2] * level - d[:, :2]
+        enough = np.sqrt(length2) * self.focal > 12.0
+        safe = np.where(enough, length2, 1.0)
+        pts.height = np.where(enough, (excess * moved).sum(axis=1) / safe, 0.0)
+        pts.sigma = np.where(enough, self.p[2] / self.focal / np.sqrt(safe), np.inf)
+        self._since_layer += 1
+        sure = pts.sigma < 6.0
+        if sure.sum() >= 20:
+            layer = ground_layer(pts.height[sure], pts.sigma[sure])
+            # One frame's crowd may be a roof: the layer moves slowly.
+            if layer is not None:
+                self._layer = layer if self._layer is None else self._layer + 0.3 * (layer - self._layer)
+        else:
+            self._layer = None
+
+    def _high(self) -> NDArray[np.bool_]:
+        # Points that are clearly not on the ground layer.
+        pts = self.points
+        if self._layer is None:
+            return np.zeros(len(pts.sigma), dtype=bool)
+        off = pts.height - self._layer
+        clear = np.maximum(self.settings.layer_m, 2.0 * np.minimum(pts.sigma, 1e6))
+        return np.asarray((off > clear) | (off < -2.0 * clear))
+
+    def _weights(self, used: NDArray[np.bool_]) -> FloatArray:
+        s = self.settings
+        # Heights that are not known yet count as those of ordinary houses.
+        height_sigma = np.full(len(used), s.unevenness_m)
+        if s.slowest_layer:
+            height_sigma = np.hypot(s.unevenness_m, np.minimum(self.points.sigma[used], 5.0) * 0.5)
+        flown_px = self.focal * math.hypot(*(self.p - self.pk)[:2]) / self.p[2]
+        sigma_px = np.hypot(s.pixel_sigma, height_sigma / self.p[2] * flown_px)
+        # The same points err the same way in the next frame: more frames a second are no more information.
+        rate = max(1.0, 1.0 / max(self._interval, 0.02))
+        return np.asarray((self.focal / sigma_px) ** 2 / rate)
+
+    def _update(self, rays: FloatArray) -> int:
+        s = self.settings
+        pts = self.points
+        usable = np.isfinite(pts.key_ray[:, 0])
+        ground = usable & ~self._high()
+        if ground.sum() >= s.min_tracks:
+            usable = ground
+        chosen = np.flatnonzero(usable)
+        if len(chosen) < s.min_tracks:
+            return 0
+        key, seen = np.ascontiguousarray(pts.key_ray[chosen]), np.ascontiguousarray(rays[chosen, :2])
+        base = self._weights(chosen)
+        weight = np.zeros(len(chosen))
+        prior = (
+            self.p,
+            self.v,
+            self.rot,
+            self.gyro_bias,
+            self.accel_bias,
+            self.delay,
+            self.bore,
+            self.pk,
+            self.rk,
+        )
+        total = np.zeros(SIZE)
+        inliers = 0
+        for turn in range(3):
+            matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+            arguments = (self.p, self.rot, self.pk, self.rk, self.camera_mount, self.v, self.omega, key, seen)
+            miss = _tie(*arguments, np.zeros(len(chosen)), matrix, vector)
+            off = miss - (np.nanmedian(miss, axis=0) if turn == 0 else 0.0)
+            size = np.hypot(off[:, 0], off[:, 1]) * self.focal
+            scale = max(0.5, 1.5 * float(np.nanmedian(size)))
+            # Cauchy weights; what is far off is left out.
+            weight = np.where(size < 5.0 * scale, base / (1.0 + (size / scale) ** 2), 0.0)
+            inliers = int((weight > 0).sum())
+            if inliers < s.min_tracks:
+                break
+            _tie(*arguments, weight, matrix, vector)
+            vector += matrix @ total
+            gain = np.linalg.solve(np.eye(SIZE) + self.cov @ matrix, self.cov)
+            total = gain @ vector
+            (
+                self.p,
+                self.v,
+                self.rot,
+                self.gyro_bias,
+                self.accel_bias,
+                self.delay,
+                self.bore,
+                self.pk,
+                self.rk,
+            ) = prior
+            self._correct(total)
+            posterior = (gain + gain.T) / 2.0
+        if inliers < s.min_tracks:
+            (
+                self.p,
+                self.v,
+                self.rot,
+                self.gyro_bias,
+                self.accel_bias,
+                self.delay,
+                self.bore,
+                self.pk,
+                self.rk,
+            ) = prior
+            return 0
+        self.cov = posterior
+        return inliers
+
+    def _drop_strays(self, rays: FloatArray) -> None:
+        # Points below the ground or far from where the plane, or their height, puts them: moving cars, wrong matches.
+        pts = self.points
+        if self._layer is None:
+            return
+        stray = np.isfinite(pts.sigma) & (
+            pts.height - self._layer < -np.maximum(4.0, 4.0 * np.minimum(pts.sigma, 1e6))
+        )
+        self.tracker.keep(~stray)
+        pts.keep(~stray)
+
+
+def run_vio(
+    times_s: FloatArray,
+    images: Iterable[NDArray[np.uint8]],
+    agl_m: FloatArray,
+    imu: Imu,
+    camera: Camera,
+    mount: Attitude,
+    settings: VioSettings | None = None,
+) -> VioResult:
+    """Odometry of a flight from its images, IMU and heights.
+
+    Args:
+        times_s: (n,) float64 times of the frames, increasing, seconds.
+        images: n grey frames, (h, w) uint8, raw (distorted) as the camera gives them.
+        agl_m: (n,) height above ground at the frames.
+        imu: readings in the body frame over the whole time.
+        camera, mount: the camera and how it sits in the body.
+
+    Raises ValueError when there are fewer than two frames or IMU readings.
+    """
+    times = np.asarray(times_s, dtype=np.float64)
+    if len(times) < 2 or len(imu.t_s) < 2:
+        raise ValueError(f"{len(times)} frames and {len(imu.t_s)} IMU readings: two of each are needed")
+    imu = Imu(*(np.ascontiguousarray(a, dtype=np.float64) for a in (imu.t_s, imu.gyro_rad_s, imu.accel_m_s2)))
+    vio = VioFilter(camera, mount, imu, settings)
+    n = len(times)
+    xyz, wxyz, velocity = np.empty((n, 3)), np.empty((n, 4)), np.empty((n, 3))
+    walk, yaw_sigma = np.empty(n), np.empty(n)
+    tracks, blind = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
+    high = 0.0
+    for i, grey in enumerate(images):
+        tracks[i], blind[i] = vio.frame(float(times[i]), grey, float(agl_m[i]))
+        xyz[i], velocity[i] = vio.p, vio.v
+        wxyz[i] = Rotation.from_matrix(vio.rot).as_quat()[[3, 0, 1, 2]]
+        walk[i], yaw_sigma[i] = vio.step_variance(), math.sqrt(max(0.0, float(vio.cov[TH + 2, TH + 2])))
+        high += float(vio._high().mean()) if len(vio.points.sigma) else 0.0
+    sigma = np.sqrt(np.maximum(np.diag(vio.cov), 0.0))
+    return VioResult(
+        Odometry(times, xyz, wxyz, "embedded visual-inertial odometry"),
+        np.maximum.accumulate(walk),
+        yaw_sigma,
+        tracks,
+        blind,
+        velocity,
+        vio.delay,
+        float(sigma[TD]),
+        vio.bore,
+        sigma[BS : BS + 3],
+        vio.gyro_bias,
+        vio.accel_bias,
+        high / n,
+    )
