@@ -249,7 +249,7 @@ def test_rates_follow_what_is_seen() -> None:
     assert (careful.rates.hit, careful.rates.false_alarm) == (0.7, 0.04)
     fixed = RateLearner(RateSettings(learn=False))
     fixed.learn(0.0, 1000.0, 1000.0, 0.0)
-    assert fixed.rates.hit == 0.85
+    assert fixed.rates.hit == RateSettings().hit
 
 
 # --- belief -------------------------------------------------------------------------------------------------------
