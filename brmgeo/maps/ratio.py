@@ -100,7 +100,7 @@ def _carry(a: Any, b: Any, c: Any) -> Any:
 
 
 @_jit_disjoint
-def _add_16(words: Any, at: Any, planes: Any, lowest: int, carry: Any) -> None:
+def _add_16(words: Any, at: Any, planes: Any, lowest: Any, carry: Any) -> None:
     """Adds 16 rows of words to planes[lowest : lowest + 4]; what overflows, of 16 times the weight, goes to carry.
 
     at: (16,) uint64 positions in words (flat) of the rows. Unsigned, since numba would test a signed index for
@@ -158,18 +158,19 @@ def _add(words: Any, base: int, offsets: Any, planes: Any, carries: Any, at: Any
 
     carries: (a row for each 16 offsets and two more, S) scratch, the last row zero; at: (16,) uint64 scratch.
     """
+    # np.int64(0), here and below: numba would compile a function once more for each plain constant.
     groups = offsets.size // 16
     for g in range(groups):
         for k in range(16):
             at[k] = np.uint64(base + offsets[16 * g + k])
-        _add_16(words, at, planes, 0, carries[g])
+        _add_16(words, at, planes, np.int64(0), carries[g])
     flat = carries.reshape(-1)
     rows, width = carries.shape
     carry = carries[rows - 2]
     for first in range(0, groups, 16):
         for k in range(16):
             at[k] = np.uint64((first + k if first + k < groups else rows - 1) * width)
-        _add_16(flat, at, planes, 4, carry)
+        _add_16(flat, at, planes, np.int64(4), carry)
         for p in range(8, planes.shape[0]):
             _half_add(planes[p], carry)
 
@@ -188,7 +189,7 @@ def _swap(low: Any, high: Any, shift: Any, mask: Any) -> None:
 
 
 @_jit
-def _transposed(planes: Any, first: int, square: Any) -> None:
+def _transposed(planes: Any, first: Any, square: Any) -> None:
     """Bit p of word k of square becomes bit k of plane first + p, or 0 where there is no such plane; square: (16, S)."""
     for p in range(16):
         word = square[p]
@@ -211,7 +212,7 @@ def _transposed(planes: Any, first: int, square: Any) -> None:
 def _emit(planes: Any, bias: int, square: Any, row: Any) -> None:
     """Writes the counts held in planes, less bias, to row (uint16, or uint32 where more than 16 planes are used)."""
     used, width = planes.shape[0], square.shape[1]
-    _transposed(planes, 0, square)
+    _transposed(planes, np.int64(0), square)
     low_bias, low_mask = np.uint16(bias & 0xFFFF), np.uint16(((1 << used) - 1) & 0xFFFF)
     if used <= 16:
         for k in range(_LANES):
@@ -223,7 +224,7 @@ def _emit(planes: Any, bias: int, square: Any, row: Any) -> None:
         piece, source = row[k * width : (k + 1) * width], square[k]
         for i in range(piece.size):
             piece[i] = source[i]
-    _transposed(planes, 16, square)
+    _transposed(planes, np.int64(16), square)
     all_bias, all_mask = np.uint32(bias & 0xFFFFFFFF), np.uint32((1 << used) - 1)
     for k in range(_LANES):
         piece, source = row[k * width : (k + 1) * width], square[k]
@@ -265,60 +266,57 @@ def _pack(mask: Any, value: int, row0: int, col0: int, border: Any, words: Any) 
             complement[i] = np.uint16(~packed[i])
 
 
-@_jit
-def _slider(words: Any, border: Any, half: Any, used: int) -> Any:
+def _slider(
+    words: NDArray[np.uint16], border: tuple[int, int], half: NDArray[np.int64], used: int
+) -> tuple[Any, ...]:
     """All that one disc needs to slide over packed words: (words, border, offsets of disc and arcs, scratch).
 
     half: (2R + 1,) int64, half-height of the disc at dx = -R..R. used: number of planes, at least 8.
     """
-    stride, radius = words.shape[2], half.size // 2
-    plane = words.shape[1] * stride
-    disc = np.empty((2 * half + 1).sum(), np.int64)
-    arcs = np.empty((2 * half.size + 15) // 16 * 16, np.int64)
-    n = 0
-    for k in range(half.size):
-        dx, h = k - radius, half[k]
-        for dy in range(-h, h + 1):
-            disc[n] = dy * stride + dx
-            n += 1
-        arcs[2 * k] = h * stride + dx
-        arcs[2 * k + 1] = plane + (-1 - h) * stride + dx
-    # Filled up to whole groups with pairs of a pixel and its complement, which come to one like any other pair.
-    for k in range(half.size, arcs.size // 2):
-        arcs[2 * k], arcs[2 * k + 1] = 0, plane
+    lines, stride = words.shape[1:]
+    radius = half.size // 2
+    dx = np.arange(-radius, radius + 1)
+    length = 2 * half + 1
+    count = int(length.sum())
+    dy = np.arange(count) - np.repeat(np.cumsum(length) - length + half, length)
+    # Filled up to whole groups: the disc with the row of zeros as row 0 sees it, ...
+    disc = np.full(-(-count // 16) * 16, (lines - 1 - border[0]) * stride - border[1])
+    disc[:count] = dy * stride + np.repeat(dx, length)
+    # ... the arcs with pairs of a pixel and its complement, which come to one like any other pair.
+    arcs = np.zeros((-(-2 * half.size // 16) * 8, 2), np.int64)
+    arcs[:, 1] = lines * stride
+    arcs[: half.size, 0] = half * stride + dx
+    arcs[: half.size, 1] += (-1 - half) * stride + dx
     strip = stride - 2 * border[1]
     most = min(max(disc.size, arcs.size), _MOST_INPUTS)
     planes = np.zeros((used, strip), np.uint16)
     square = np.empty((16, strip), np.uint16)
-    carries = np.zeros((most // 16 + 3, strip), np.uint16)
-    return words, border, disc, arcs, planes, square, carries, np.empty(16, np.uint64)
+    carries = np.zeros((-(-most // 16) + 2, strip), np.uint16)
+    return words, border, disc, arcs.ravel(), planes, square, carries, np.empty(16, np.uint64)
 
 
 @_jit
-def _slide(slider: Any, y: int, steps: int, row: Any) -> None:
-    """Counts of the tile's row y into row: from nothing when steps is 0, else one row on, for the steps-th time."""
+def _slide(slider: Any, y: int, row: Any) -> None:
+    """Counts of the tile's row y into row: from nothing for row 0, for each other row from the one before it."""
     words, border, disc, arcs, planes, square, carries, at = slider
-    stride = words.shape[2]
-    base = (y + border[0]) * stride + border[1]
+    base = (y + border[0]) * words.shape[2] + border[1]
     flat = words.reshape(-1)
     # One place that adds, for both: the adders are long when compiled.
     source = arcs
-    if steps == 0:
+    if y == 0:
         planes[:] = 0
-        source = np.full((disc.size + 15) // 16 * 16, (words.shape[1] - 1) * stride - base)
-        source[: disc.size] = disc
+        source = disc
     for first in range(0, source.size, _MOST_INPUTS):
         _add(flat, base, source[first : first + _MOST_INPUTS], planes, carries, at)
-    _emit(planes, steps * (arcs.size // 2), square, row)
+    _emit(planes, y * (arcs.size // 2), square, row)
 
 
 @_jit
-def _count_tile(words: Any, border: Any, half: Any, used: int, tile: Any, out: Any) -> None:
+def _count_tile(slider: Any, tile: Any, out: Any) -> None:
     """Counts of a tile (row0, row1, col0, col1) into the whole out (H, W)."""
     row0, row1, col0, col1 = tile
-    slider = _slider(words, border, half, used)
     for y in range(row1 - row0):
-        _slide(slider, y, y, out[row0 + y, col0:col1])
+        _slide(slider, y, out[row0 + y, col0:col1])
 
 
 @_jit
@@ -397,30 +395,27 @@ def _divide_by(count: Any, known: int, out: Any) -> None:
 
 @_jit
 def _ratio_tile(
-    words: Any, dark: Any, dark_window: Any, border: Any, disc: Any, used: int, tile: Any, out: Any, row: Any
+    slider: Any, shadow: Any, dark_window: Any, chord: Any, tile: Any, out: Any, scratch: Any
 ) -> None:
-    """Ratios of a tile (row0, row1, col0, col1) into the whole out (H, W); disc is its half-heights and half-widths.
+    """Ratios of a tile (row0, row1, col0, col1) into the whole out (H, W).
 
-    words, dark: packed building and unknown pixels; dark covers dark_window = (row0, row1, col0, col1) of the tile,
-    outside of which no disc holds an unknown pixel. row: (col1 - col0,) scratch, uint16 or uint32.
+    slider, shadow: of the building and of the unknown pixels; shadow's words cover dark_window = (row0, row1, col0,
+    col1) of the tile, outside of which no disc holds an unknown pixel. chord: half-widths of the disc at dy = -R..R.
+    scratch: two rows of counts (col1 - col0,), uint16 or uint32, one of int64, and (R + 1,) int64, R along x.
     """
     height, width = out.shape
     row0, row1, col0, col1 = tile
     dark0, dark1, left, right = dark_window
-    half, chord = disc
-    radius, radius_y = half.size // 2, chord.size // 2
-    slider = _slider(words, border, half, used)
-    shadow = _slider(dark, border, half, used)
-    unknown = np.zeros_like(row[left:right])
-    known = np.empty(row.size, np.int64)
-    reach = np.zeros(radius + 1, np.int64)
+    row, covered, known, reach = scratch
+    unknown = covered[left:right]
+    radius, radius_y = reach.size - 1, chord.size // 2
     # Columns [inner0, inner1) of the tile are a radius away from the array's sides.
     inner0 = min(max(radius - col0, 0), row.size)
     inner1 = max(min(width - radius - col0, row.size), inner0)
     seen = -1
     number = 0
     for y in range(row1 - row0):
-        _slide(slider, y, y, row)
+        _slide(slider, y, row)
         here = row0 + y
         # Away from the array's top and bottom all rows are clipped alike.
         alike = min(here, radius_y) + (height + 1) * min(height - 1 - here, radius_y)
@@ -436,7 +431,7 @@ def _ratio_tile(
             _divide_by(row[inner0:inner1], known[inner0], target[inner0:inner1])
         _divide(row[inner1:], known[inner1:], target[inner1:])
         if dark0 <= y < dark1 and left < right:
-            _slide(shadow, y - dark0, y - dark0, unknown)
+            _slide(shadow, y - dark0, unknown)
             _divide(row[left:right], known[left:right] - unknown, target[left:right])
 
 
@@ -549,7 +544,7 @@ def disc_counts(mask: NDArray[np.bool_] | NDArray[np.uint8], radius_px: float, *
     out = np.empty(shape, _count_dtype(radius_px))
 
     def work(tile: tuple[int, int, int, int]) -> None:
-        _count_tile(_packed(pixels, 1, tile, border), border, half, used, tile, out)
+        _count_tile(_slider(_packed(pixels, 1, tile, border), border, half, used), tile, out)
 
     _each(work, _tiles(shape, -(-shape[0] // max(threads, 1)), _LANES * _STRIP_MAX), threads)
     return cast(_Count, out)
@@ -635,8 +630,14 @@ def ratio_maps(
                 dark = _packed(pixels, UNKNOWN, reached, border)
                 window = (reached[0] - row0, reached[1] - row0, reached[2] - col0, reached[3] - col0)
         for (half, chord, used), radius, band in zip(discs, radii_px, maps):
-            row = np.empty(col1 - col0, _count_dtype(radius))
-            _ratio_tile(words, dark, window, border, (half, chord), used, tile, band, row)
+            slider = _slider(words, border, half, used)
+            shadow = _slider(dark, border, half, used) if window[1] > window[0] else slider
+            width, dtype = col1 - col0, _count_dtype(radius)
+            scratch = (
+                np.empty(width, dtype), np.zeros(width, dtype),
+                np.empty(width, np.int64), np.empty(half.size // 2 + 1, np.int64),
+            )  # fmt: skip
+            _ratio_tile(slider, shadow, window, chord, tile, band, scratch)
 
     # Small tiles where something is unknown: it then touches few of them, and the others are spared the second disc.
     rows, cols = (1024, 2048) if some_unknown else (shape[0], _LANES * _STRIP_MAX)
