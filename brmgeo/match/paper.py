@@ -13,8 +13,9 @@ One step:
 
 Where the text leaves a choice, this is what is done here:
 
-- The odometry's turn between the two steps is added to theta. The text's straight-line heading would lose every
-  candidate at a corner; where the flight goes straight both are the same.
+- Theta is the heading through the two previous candidates and nothing else. A flight that turns by more than the box
+  forgives loses its candidates there and starts again; ``PaperSettings.follow_turns`` adds the odometry's turn
+  between the two steps to theta, which the text does not.
 - The pairs (b, c) behind eq. 4 are followed one by one while that is affordable (``PaperSettings.pair_work``
   box tests); with more candidates than that nearly every heading occurs at nearly every candidate, and any
   heading is allowed. That keeps more candidates, never fewer.
@@ -411,7 +412,7 @@ class PaperMatcher:
             return -1
         step = np.asarray(motion.step_m, np.float64)
         turn = 0.0
-        if np.hypot(*step) > 0 and np.hypot(*self._last_step) > 0:
+        if self.settings.paper.follow_turns and np.hypot(*step) > 0 and np.hypot(*self._last_step) > 0:
             turn = math.atan2(step[1], step[0]) - math.atan2(self._last_step[1], self._last_step[0])
         places, start = self._listed()
         n = _follow_pairs(

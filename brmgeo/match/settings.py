@@ -199,7 +199,7 @@ class RatioSettings:
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """The paper's constants (eq. 4-7).
+    """The paper's constants (eq. 4-7); the defaults are its own figures.
 
     Attributes:
         radii: n, number of radii, [1, 16].
@@ -208,13 +208,16 @@ class PaperSettings:
         d_max_m: converged when every candidate lies this close to their mean, metres, [0.1, 1000].
         pair_work: eq. 4 is applied pair by pair while that takes no more box tests than this, [0, 1e10]; above it,
             any heading is allowed.
+        follow_turns: whether the odometry's turn between two steps is added to the heading through the two previous
+            candidates. The paper does not; without it a flight that turns loses its candidates and starts again.
     """
 
     radii: int = 3
-    e1: float = 0.12
-    eps_m: float = 10.0
-    d_max_m: float = 25.0
+    e1: float = 0.3
+    eps_m: float = 25.0
+    d_max_m: float = 75.0
     pair_work: int = 60_000_000
+    follow_turns: bool = False
 
     def __post_init__(self) -> None:
         _check(self, radii=(1, 16), e1=(1e-6, 16), eps_m=(0.1, 500), d_max_m=(0.1, 1000), pair_work=(0, 1e10))

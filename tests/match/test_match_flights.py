@@ -220,6 +220,24 @@ def test_paper_narrows_the_candidates_to_the_truth() -> None:
     assert np.isfinite(matcher.smooth().xy[fixes[0] :]).all()
 
 
+def test_paper_heading_is_the_line_through_two_candidates_unless_turns_are_followed() -> None:
+    assert PaperSettings() == PaperSettings(radii=3, e1=0.3, eps_m=25.0, d_max_m=75.0, follow_turns=False)
+    scene = town(42, 600.0, 330)
+    # Straight on, then a right angle: the box about the straight line does not hold the place behind the corner.
+    f = fly(scene, *path((1180.0, 5300.0), [(0.0, 6), (-math.pi / 2, 1)], step_m=25.0), missed=0.0)
+    at_the_corner = {}
+    for follow in (False, True):
+        paper = PaperSettings(radii=6, e1=0.06, eps_m=6.0, d_max_m=20.0, follow_turns=follow)
+        estimates = run(make_matcher("paper", scene.ground(), MatchSettings(paper=paper)), f)
+        assert estimates[5].status == "converged"
+        at_the_corner[follow] = estimates[-1]
+    assert at_the_corner[True].extra["restarted"] == 0
+    assert math.hypot(*(at_the_corner[True].mean - f.xy[-1])) < 10
+    # Nothing of the true place was kept: the set is the frame's own search, or lies where the line led.
+    kept = at_the_corner[False]
+    assert kept.extra["restarted"] == 1 or np.hypot(*(kept.candidates - f.xy[-1]).T).min() > 15
+
+
 def test_paper_starts_again_when_nothing_is_left() -> None:
     scene = town(41, 500.0, 140)
     matcher = make_matcher("paper", scene.ground(2.0), MatchSettings(paper=PaperSettings(e1=0.02, eps_m=1.0)))
