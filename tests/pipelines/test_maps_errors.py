@@ -181,6 +181,23 @@ def test_imagery_of_another_place(region: SmallRegion, maps: Callable[[], Answer
     says(maps(), "ortho.tif", "missing")
 
 
+def test_a_service_is_asked_by_maps_alone(
+    region: SmallRegion, maps: Callable[[], Answer], capsys: Capture
+) -> None:
+    url = "http://127.0.0.1:9/{z}/{x}/{y}.png"
+    region.edit('kind = "tiles"\npath = "tiles"', f'kind = "service"\nurl = "{url}"\nretries = 0')
+    for command in (("status", "small"), ("why", "small", "ratio")):
+        says(
+            brmgeo(capsys, *command, "--data", region.data),
+            url,
+            "has been fetched yet",
+            "`brmgeo maps small`",
+        )
+    says(maps(), "127.0.0.1:9", "tiles")
+    region.edit('terms = "free for all"', "")
+    says(maps(), "imagery", "terms")
+
+
 # --- region files ---------------------------------------------------------------------------------------------
 
 
