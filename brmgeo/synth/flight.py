@@ -1015,7 +1015,8 @@ def imu_of(course: Course, seed: int) -> tuple[FloatArray, FloatArray]:
     roll, pitch, yaw = course.roll_pitch_yaw.T
     turn = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=-1))
     gyro = (turn[:-1].inv() * turn[1:]).as_rotvec() * RATE_HZ
-    gyro = np.concatenate([gyro, gyro[-1:]])
+    # A reading is of its own time, not of the hundredth of a second after it.
+    gyro = (np.concatenate([gyro[:1], gyro]) + np.concatenate([gyro, gyro[-1:]])) / 2.0
     velocity = np.gradient(course.xyz_m, course.t_s, axis=0)
     accel = np.gradient(velocity, course.t_s, axis=0)
     accel = turn.inv().apply(accel + [0.0, 0.0, GRAVITY])
