@@ -12,6 +12,7 @@ position and yaw of the first frame. Frames a second are processor time of one c
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import sys
@@ -28,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import cv2
 import numpy as np
 
-from brmgeo.flight.camera import ray_from_pixel, world_from_camera
+from brmgeo.flight.camera import ray_from_pixel
 from brmgeo.flight.readings import Attitude, Camera, Imu
 from brmgeo.flight.vio import VioResult, VioSettings, run_vio
 from brmgeo.synth.flight import Course, FlightSettings, Imagery, Simulator, fly, imu_of, rectangle
@@ -78,10 +79,10 @@ CONDITIONS = [
     Condition("blind 10 s", "no frames for 10 s", blind_s=(100.0, 110.0)),
     Condition("rolling shutter", "rows read over 20 ms", rolling_s=0.02),
     Condition("terrain", "smooth hills, +-10 m over 300 m; AGL follows", hills_m=10.0),
-    Condition("town", "buildings 3-20 m", buildings="town"),
-    Condition("town, all points", "the same without slowest layer", buildings="town", vio={"slowest_layer": False}),
-    Condition("towers", "buildings 40-60 m", buildings="towers"),
-    Condition("towers, all points", "the same without slowest layer", buildings="towers", vio={"slowest_layer": False}),
+    Condition("town", "buildings 3-20 m, 5 Hz", hz=5.0, buildings="town"),
+    Condition("town, all points", "the same without slowest layer", hz=5.0, buildings="town", vio={"slowest_layer": False}),
+    Condition("towers", "a third 40-60 m high, 5 Hz", hz=5.0, buildings="towers"),
+    Condition("towers, all points", "the same without slowest layer", hz=5.0, buildings="towers", vio={"slowest_layer": False}),
 ]  # fmt: skip
 
 
@@ -107,13 +108,20 @@ def draw_flat(course: Course, settings: FlightSettings, imagery: Imagery, condit
     rays = ray_from_pixel(camera, np.stack([u, v], -1)).astype(np.float32)
     # Noise is drawn once and shifted: drawing it anew would be most of the time.
     noise = (rng.standard_normal((camera.height + 64, camera.width + 64)) * settings.noise_levels).astype(np.float32)
-    bore = world_from_camera(Attitude(*(math.radians(a) for a in condition.boresight_deg)), 0.0, 0.0, 0.0)
+    bore = Attitude(*(math.radians(a) for a in condition.boresight_deg)).matrix()
     shutter = np.linspace(-0.5, 0.5, 9) * settings.exposure_s if settings.exposure_s else [0.0]
     late = np.linspace(0.0, condition.rolling_s, camera.height) if condition.rolling_s else None
     for row in course.frame_index:
         light = np.zeros((camera.height, camera.width), dtype=np.float32)
         for dt in shutter:
             when = course.t_s[row] + dt
+            if late is None and not settings.camera.is_distorted and not condition.hills_m:
+                matrix = _homography(course, settings, imagery, bore, when)
+                size = (camera.width, camera.height)
+                flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+                seen = cv2.warpPerspective(grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REFLECT)
+                light += seen
+                continue
             if late is None:
                 columns, rows = _footpoints(course, settings, imagery, rays, bore, when, condition)
             else:
@@ -122,23 +130,37 @@ def draw_flat(course: Course, settings: FlightSettings, imagery: Imagery, condit
                 b = _footpoints(course, settings, imagery, rays, bore, when + condition.rolling_s, condition)
                 share = (late / condition.rolling_s).astype(np.float32)[:, None]
                 columns, rows = (x + share * (y - x) for x, y in zip(a, b))
-            light += cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32)
-        light /= len(shutter)
-        light = 110.0 + condition.contrast * (light - 110.0)
-        light *= math.exp(settings.exposure_sigma * rng.standard_normal())
+            light += cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        gain = math.exp(settings.exposure_sigma * rng.standard_normal())
         r, c = rng.integers(0, 64, 2)
-        light += noise[r : r + camera.height, c : c + camera.width]
-        yield np.clip(light, 0, 255).astype(np.uint8)
+        grain = noise[r : r + camera.height, c : c + camera.width]
+        scale = gain * condition.contrast / len(shutter)
+        light = cv2.addWeighted(light, scale, grain, 1.0, 110.0 * gain * (1.0 - condition.contrast))
+        yield np.asarray(cv2.convertScaleAbs(np.maximum(light, 0.0)), dtype=np.uint8)
+
+
+def _camera_at(course: Course, settings: FlightSettings, bore: Any, when: float) -> tuple[Any, Any]:
+    place = np.array([np.interp(when, course.t_s, course.xyz_m[:, k]) for k in range(3)])
+    roll, pitch, yaw = (np.interp(when, course.t_s, course.roll_pitch_yaw[:, k]) for k in range(3))
+    return place, Attitude(roll, pitch, yaw).matrix() @ bore @ settings.mount.body_from_camera()
+
+
+def _homography(course: Course, settings: FlightSettings, imagery: Imagery, bore: Any, when: float) -> Any:
+    # Imagery pixel from frame pixel, both with whole numbers at centres.
+    place, cam = _camera_at(course, settings, bore, when)
+    lens = settings.camera
+    inverse = np.linalg.inv(np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]]))
+    ground = np.array([[place[2], 0, -place[0]], [0, place[2], -place[1]], [0, 0, -1.0]])
+    to_image = np.array(
+        [[1, 0, -imagery.left - imagery.gsd_m / 2], [0, -1, imagery.top - imagery.gsd_m / 2], [0, 0, imagery.gsd_m]]
+    )
+    return to_image @ ground @ cam @ inverse
 
 
 def _footpoints(
     course: Course, settings: FlightSettings, imagery: Imagery, rays: Any, bore: Any, when: float, condition: Condition
 ) -> tuple[Any, Any]:
-    x, y, z = (np.interp(when, course.t_s, course.xyz_m[:, k]) for k in range(3))
-    roll, pitch, yaw = (np.interp(when, course.t_s, course.roll_pitch_yaw[:, k]) for k in range(3))
-    mount = settings.mount.body_from_camera()
-    nadir = Attitude().body_from_camera()
-    cam = Attitude(roll, pitch, yaw).matrix() @ bore @ nadir.T @ mount
+    (x, y, z), cam = _camera_at(course, settings, bore, when)
     world = rays @ cam.T.astype(np.float32)
     reach = z / -np.minimum(world[..., 2], -0.05)
     for _ in range(4 if condition.hills_m else 0):
@@ -280,21 +302,31 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="conditions (default: all)")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--no-write", action="store_true")
+    parser.add_argument("--results", type=Path, help="JSON lines: what is there is not flown again, new rows are added.")
+    parser.add_argument("--write", action="store_true", help="Write the table to docs/odometry.md.")
     given = parser.parse_args()
     cv2.setNumThreads(1)
     imagery, ground = read_demo()
+    done: dict[tuple[str, int], dict[str, float]] = {}
+    if given.results is not None and given.results.exists():
+        for line in given.results.read_text(encoding="utf-8").splitlines():
+            row = json.loads(line)
+            done[row.pop("condition"), row.pop("seed")] = row
     lines = []
     for condition in CONDITIONS:
         if given.names and condition.name not in given.names:
             continue
         rows = []
         for seed in range(given.first, given.first + given.seeds):
-            rows.append(fly_once(condition, seed, imagery, ground))
+            row = done.get((condition.name, seed)) or fly_once(condition, seed, imagery, ground)
+            rows.append(row)
+            if given.results is not None and (condition.name, seed) not in done:
+                with given.results.open("a", encoding="utf-8") as out:
+                    out.write(json.dumps({"condition": condition.name, "seed": seed} | row) + "\n")
             print(condition.name, seed, {k: round(v, 3) for k, v in rows[-1].items()}, flush=True)
         lines.append(table_row(condition, rows))
         print(lines[-1], flush=True)
-    if not given.names and not given.no_write:
+    if given.write:
         write(lines, given.seeds)
 
 

@@ -218,24 +218,31 @@ def _tie(p, rot, pk, rotk, rbc, vel, omega, rays, seen, weight, matrix, vector):
         out[j, 1] = seen[j, 1] - y[1] / y[2]
         if weight[j] <= 0.0:
             continue
-        plane = np.eye(3)
-        for r in range(3):
-            plane[r, 2] -= w[r] / w[2]
-        dx = inv @ plane  # change of y with the keyframe's position
-        dy[:, :] = 0.0
-        a_theta = inv @ _skew(d)
-        a_clone = -lam * (dx @ _skew(w))
+        # y = C'(X - p); X = pk + lam w moves with the keyframe's pose within the plane.
         in_body = rbc @ rays[j]
-        a_bore = rbc.T @ _skew(rot.T @ d) - lam * (dx @ (rotk @ _skew(in_body)))
-        a_delay = a_theta @ turn_rate - inv @ vel
+        d_body = rot.T @ d
         for r in range(3):
+            slope = -(inv[r, 0] * w[0] + inv[r, 1] * w[1] + inv[r, 2] * w[2]) / w[2]
+            dx0, dx1, dx2 = inv[r, 0], inv[r, 1], inv[r, 2] + slope
+            # Rows of dx [w]x, of inv [d]x, and of the boresight's two parts: row x [v]x is the cross product row x v.
+            dy[r, 0], dy[r, 1], dy[r, 2] = -inv[r, 0], -inv[r, 1], -inv[r, 2]
+            dy[r, 6] = inv[r, 1] * d[2] - inv[r, 2] * d[1]
+            dy[r, 7] = inv[r, 2] * d[0] - inv[r, 0] * d[2]
+            dy[r, 8] = inv[r, 0] * d[1] - inv[r, 1] * d[0]
+            dy[r, 15] = 0.0
             for c in range(3):
-                dy[r, c] = -inv[r, c]
-                dy[r, 6 + c] = a_theta[r, c]
-                dy[r, 16 + c] = a_bore[r, c]
-                dy[r, 19 + c] = dx[r, c]
-                dy[r, 22 + c] = a_clone[r, c]
-            dy[r, 15] = a_delay[r]
+                dy[r, 15] += dy[r, 6 + c] * turn_rate[c] - inv[r, c] * vel[c]
+            e0 = dx0 * rotk[0, 0] + dx1 * rotk[1, 0] + dx2 * rotk[2, 0]
+            e1 = dx0 * rotk[0, 1] + dx1 * rotk[1, 1] + dx2 * rotk[2, 1]
+            e2 = dx0 * rotk[0, 2] + dx1 * rotk[1, 2] + dx2 * rotk[2, 2]
+            b0, b1, b2 = rbc[0, r], rbc[1, r], rbc[2, r]
+            dy[r, 16] = b1 * d_body[2] - b2 * d_body[1] - lam * (e1 * in_body[2] - e2 * in_body[1])
+            dy[r, 17] = b2 * d_body[0] - b0 * d_body[2] - lam * (e2 * in_body[0] - e0 * in_body[2])
+            dy[r, 18] = b0 * d_body[1] - b1 * d_body[0] - lam * (e0 * in_body[1] - e1 * in_body[0])
+            dy[r, 19], dy[r, 20], dy[r, 21] = dx0, dx1, dx2
+            dy[r, 22] = -lam * (dx1 * w[2] - dx2 * w[1])
+            dy[r, 23] = -lam * (dx2 * w[0] - dx0 * w[2])
+            dy[r, 24] = -lam * (dx0 * w[1] - dx1 * w[0])
         for c in range(25):
             jac[0, c] = (dy[0, c] - y[0] / y[2] * dy[2, c]) / y[2]
             jac[1, c] = (dy[1, c] - y[1] / y[2] * dy[2, c]) / y[2]
@@ -311,7 +318,7 @@ class VioFilter:
         self.points = _Points()
         self.rbc = mount.body_from_camera()
         self.delay = 0.0
-        self.bore = np.zeros(3)
+        self.bore: FloatArray = np.eye(3)
         self.gyro_bias, self.accel_bias = np.zeros(3), np.zeros(3)
         self.omega = np.zeros(3)
         self.walk = 0.0
@@ -388,7 +395,7 @@ class VioFilter:
     @property
     def camera_mount(self) -> FloatArray:
         """(3, 3) body_from_camera with the boresight estimated so far."""
-        return np.asarray(_exp(self.bore) @ self.rbc)
+        return np.asarray(self.bore @ self.rbc)
 
     def step_variance(self) -> float:
         """Variance per axis gathered since the start, square metres, heading left out."""
@@ -450,7 +457,7 @@ class VioFilter:
         self.gyro_bias = self.gyro_bias + dx[BG : BG + 3]
         self.accel_bias = self.accel_bias + dx[BA : BA + 3]
         self.delay += float(dx[TD])
-        self.bore = Rotation.from_matrix(_exp(dx[BS : BS + 3]) @ _exp(self.bore)).as_rotvec()
+        self.bore = np.asarray(_exp(dx[BS : BS + 3]) @ self.bore)
         self.pk = self.pk + dx[CP : CP + 3]
         self.rk = np.asarray(_exp(dx[CT : CT + 3]) @ self.rk)
 
@@ -553,7 +560,7 @@ class VioFilter:
         )
         total = np.zeros(SIZE)
         inliers = 0
-        for turn in range(3):
+        for turn in range(2):
             matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
             arguments = (self.p, self.rot, self.pk, self.rk, self.camera_mount, self.v, self.omega, key, seen)
             miss = _tie(*arguments, np.zeros(len(chosen)), matrix, vector)
@@ -656,7 +663,7 @@ def run_vio(
         velocity,
         vio.delay,
         float(sigma[TD]),
-        vio.bore,
+        Rotation.from_matrix(vio.bore).as_rotvec(),
         sigma[BS : BS + 3],
         vio.gyro_bias,
         vio.accel_bias,
