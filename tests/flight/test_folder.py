@@ -333,7 +333,7 @@ FAULTS: list[tuple[str, Fault, str]] = [
     ("no agl", lambda f: (f / "frames.csv").write_text("t_s,file\n0,f0.jpg\n"), "no column agl_m"),
     ("odometry gone", lambda f: (f / "odometry.csv").unlink(), "odometry.csv: the file is missing"),
     ("no format", lambda f: edit(f / "flight.toml", 'format = "csv"\n', ""), r"flight.toml:10: .*'format'"),
-    ("planned format", lambda f: edit(f / "flight.toml", '"csv"', '"rosbag"'), "convert it to one of"),
+    ("no bag", lambda f: edit(f / "flight.toml", '"csv"', '"rosbag"'), "damaged, cut short or not indexed"),
     (
         "quaternion order",
         lambda f: edit(f / "flight.toml", '"csv"', '"csv"\nquaternion = "zyxw"'),

@@ -88,7 +88,10 @@ def _reader(kind: str) -> Reader:
             raise FlightError(
                 f"{path}: quaternion order is given, but this format names its parts: remove 'quaternion'"
             )
-        log = _READERS[kind](path, LogOptions(options.topic))
+        try:
+            log = _READERS[kind](path, LogOptions(options.topic))
+        except MissingInputError as error:
+            raise FlightError(str(error)) from None
         if log.odometry is None or not len(log.odometry.t_s):
             raise FlightError(f"{path}: the log holds no odometry: remove [odometry] or give another file")
         return log.odometry

@@ -77,6 +77,19 @@ def _opened(path: Path, names: tuple[str, ...], log: Any) -> dict[str, list[Any]
 
 
 @contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    # The library's C part complains of every damaged byte straight to file descriptor 2.
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@contextlib.contextmanager
 def _library(path: Path) -> Iterator[Any]:
     os.environ.setdefault("MAVLINK20", "1")
     try:
@@ -86,7 +99,7 @@ def _library(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise MissingInputError(f"{path}: the log is missing")
     try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), _quiet():
             yield DFReader, mavutil
     except FlightError:
         raise

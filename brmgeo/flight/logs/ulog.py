@@ -54,8 +54,8 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
         raise MissingInputError(f"{path}: the log is missing")
     said = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said):  # the library reports damage by printing
-            log = ULog(str(path))
+        with contextlib.redirect_stdout(said), path.open("rb") as file:  # the library reports damage by printing
+            log = ULog(file)
     except Exception as error:  # damaged bytes make the library raise nearly anything
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise FlightError(

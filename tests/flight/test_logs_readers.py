@@ -1,0 +1,263 @@
+"""Every binary format tells the same flight: position, attitude, rates, height, GNSS, pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from log_writers import (
+    ACCEL,
+    GYRO,
+    LAT,
+    LON,
+    WXYZ,
+    XYZ,
+    T,
+    bag,
+    dataflash,
+    picture,
+    px4,
+    telemetry,
+    turn_between,
+)
+
+from brmgeo.errors import FlightError, InputError, MissingInputError
+from brmgeo.flight.logs import Log, LogOptions, kind_of, read_log
+from brmgeo.flight.odometry import OdometryOptions, read_odometry
+
+pytest.importorskip("rosbags")
+pytest.importorskip("pyulog")
+pytest.importorskip("pymavlink")
+
+
+def check_track(log: Log, *, xyz_m: float = 1e-3, turn_rad: float = 1e-3, skip: int = 0) -> None:
+    assert log.odometry is not None
+    o = log.odometry
+    assert len(o.t_s) == len(T) - skip
+    assert np.allclose(o.t_s, T[skip:], atol=1e-6)
+    assert np.abs(o.xyz_m - XYZ[skip:]).max() < xyz_m
+    assert turn_between(o.wxyz, WXYZ[skip:]) < turn_rad
+
+
+def check_imu(log: Log, gyro: float = 1e-5, accel: float = 1e-4) -> None:
+    assert log.imu is not None
+    assert np.abs(log.imu.gyro_rad_s - GYRO).max() < gyro
+    assert np.abs(log.imu.accel_m_s2 - ACCEL).max() < accel
+
+
+def check_gnss(log: Log, sigma: float) -> None:
+    assert log.gnss is not None
+    at = np.searchsorted(T, log.gnss.t_s - 1e-6)
+    assert np.abs(log.gnss.lon_deg - LON[at]).max() < 1e-7
+    assert np.abs(log.gnss.lat_deg - LAT[at]).max() < 1e-7
+    if np.isfinite(sigma):
+        assert log.gnss.sigma_m == pytest.approx(np.full(len(at), sigma), rel=1e-5)
+    else:
+        assert np.isnan(log.gnss.sigma_m).all()
+
+
+@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap"])
+def test_bags_tell_the_flight_by_their_stamps(tmp_path: Path, kind: str) -> None:
+    path = bag(tmp_path / "flight", kind)
+    assert kind_of(path) == "rosbag"
+    log = read_log(path)
+    check_track(log, xyz_m=1e-9, turn_rad=1e-7)
+    check_imu(log, 1e-9, 1e-9)
+    check_gnss(log, 0.8)
+    assert log.height is not None
+    assert np.allclose(log.height.agl_m, XYZ[::2, 2], atol=1e-4)
+    assert log.camera is not None
+    assert (log.camera.fx, log.camera.fy, log.camera.distortion[0]) == (50.0, 51.0, 0.01)
+    assert log.frames is not None
+    assert np.allclose(log.frames.t_s, T[::20], atol=1e-6)
+    images = dict(log.frames.images())
+    assert all(np.array_equal(images[i], picture(i)) for i in range(len(log.frames.names)))
+    # Recording lags the stamps; the stamps are what counts.
+    assert all(offset == pytest.approx(-0.25, abs=1e-3) for _, offset in log.stamp_offset_s)
+
+
+def test_a_bag_file_inside_its_folder_is_the_bag(tmp_path: Path) -> None:
+    folder = bag(tmp_path / "flight", "db3", topics=("odom",))
+    check_track(read_log(next(folder.glob("*.db3"))))
+    folder = bag(tmp_path / "other", "mcap", topics=("pose",))
+    check_track(read_log(next(folder.glob("*.mcap"))))
+    assert np.array_equal(read_odometry(folder, "rosbag").t_s, read_log(folder).odometry.t_s)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "mono8", "jpeg"])
+def test_pictures_in_other_encodings(tmp_path: Path, encoding: str) -> None:
+    frames = read_log(bag(tmp_path / "flight", "mcap", topics=("odom", "image"), encoding=encoding)).frames
+    assert frames is not None
+    for i, image in frames.images():
+        if encoding == "rgb8":
+            assert np.array_equal(image, picture(i))
+        elif encoding == "mono8":
+            assert np.array_equal(image, cv2.cvtColor(picture(i), cv2.COLOR_BGR2GRAY))
+        else:
+            assert isinstance(image, bytes)
+            assert frames.names[i].endswith(".jpg")
+            decoded = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+            assert np.abs(decoded.astype(int) - picture(i)).mean() < 6
+
+
+def test_a_bag_with_several_odometries_lists_them(tmp_path: Path) -> None:
+    path = bag(tmp_path / "flight", "mcap", topics=("odom", "pose"), twice=True)
+    with pytest.raises(
+        FlightError, match=r"choose one with --topic: /vins/odometry \(400\), /other/odometry \(400\)$"
+    ):
+        read_log(path)
+    with pytest.raises(FlightError, match=r"no odometry named '/nothing': there is /vins"):
+        read_log(path, LogOptions("/nothing"))
+    for topic in ("/other/odometry", "/pose"):
+        check_track(read_log(path, LogOptions(topic)))
+        assert read_odometry(path, "rosbag", OdometryOptions(topic=topic)).source == topic
+
+
+def test_stamps_that_jump_back_are_refused_and_overtaking_ones_sorted(tmp_path: Path) -> None:
+    jumped = T.copy()
+    jumped[200:] -= 5.0
+    with pytest.raises(
+        FlightError, match=r"/vins/odometry: out of order: message 201 is stamped .* 4.950 s before"
+    ):
+        read_log(bag(tmp_path / "jumped", "mcap", topics=("odom",), stamps=jumped))
+    with pytest.raises(FlightError, match=r"/camera/image_raw: out of order: message 11"):
+        read_log(bag(tmp_path / "images", "mcap", topics=("image",), stamps=jumped))
+    with pytest.raises(FlightError, match=r"every header.stamp is zero"):
+        read_log(bag(tmp_path / "zero", "mcap", topics=("odom",), stamps=T * 0))
+    swapped = T.copy()
+    swapped[[100, 101]] = swapped[[101, 100]]
+    log = read_log(bag(tmp_path / "swapped", "mcap", topics=("odom",), stamps=swapped))
+    assert log.odometry is not None
+    assert np.allclose(log.odometry.t_s, T)
+    assert log.odometry.xyz_m[100] == pytest.approx(XYZ[101])
+    assert any("1 messages overtook" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap"])
+def test_a_truncated_bag_is_one_clear_line(tmp_path: Path, kind: str) -> None:
+    path = bag(tmp_path / "flight", kind, topics=("odom", "imu"))
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    whole = file.read_bytes()
+    for share in (0.0, 0.5, 0.97):
+        file.write_bytes(whole[: int(len(whole) * share)])
+        with pytest.raises(FlightError, match="damaged, cut short or not indexed") as caught:
+            read_log(path, LogOptions())
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("version", ["local", "old", "new", "vision"])
+def test_px4_logs_of_all_versions_tell_the_flight(tmp_path: Path, version: str) -> None:
+    log = read_log(px4(tmp_path / "log.ulg", version=version))
+    check_track(log, skip=6 if version == "local" else 0)
+    check_imu(log)
+    assert log.odometry is not None
+    segment = log.odometry.segment
+    assert segment is not None
+    if version in ("local", "new"):
+        check_gnss(log, 0.9)
+        assert log.uses_gnss
+        assert [t for t, _ in log.resets] == pytest.approx([T[200]])
+        assert int(np.diff(segment).argmax()) + 1 == 200 - (6 if version == "local" else 0)
+    else:
+        assert not segment.any()
+    if version == "vision":
+        assert log.uses_gnss is None
+    assert log.attitude is not None
+    assert turn_between(log.attitude.wxyz, WXYZ) < 1e-3
+    assert log.height is not None
+    assert (log.height.source, log.height.above) == ("distance_sensor", "ground")
+    assert np.allclose(log.height.agl_m, XYZ[::4, 2], atol=1e-4)
+    assert log.triggers_s is not None
+    assert np.allclose(log.triggers_s, T[::60])
+
+
+def test_px4_dropouts_are_told_and_damage_is_noted_or_refused(tmp_path: Path) -> None:
+    log = read_log(px4(tmp_path / "log.ulg", dropout_ms=480))
+    assert [d for _, d in log.lost] == [0.48]
+    whole = (tmp_path / "log.ulg").read_bytes()
+    cut = tmp_path / "cut.ulg"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    part = read_log(cut)
+    assert part.odometry is not None
+    assert 200 < len(part.odometry.t_s) < 350
+    cut.write_bytes(whole[:450])
+    with pytest.raises(FlightError, match=r"breaks off before its first data|no readable ULog"):
+        read_log(cut)
+    cut.write_bytes(b"not a log at all" * 20)
+    with pytest.raises(FlightError, match="no readable ULog"):
+        read_log(cut)
+
+
+@pytest.mark.parametrize("era", ["TimeUS", "TimeMS"])
+def test_ardupilot_logs_of_both_eras_tell_the_flight(tmp_path: Path, era: str) -> None:
+    log = read_log(dataflash(tmp_path / "log.bin", era=era))
+    check_track(log, skip=4)
+    check_imu(log)
+    check_gnss(log, np.nan)
+    assert log.height is not None
+    assert log.height.source == "RFND"
+    assert np.allclose(log.height.agl_m, XYZ[::2, 2], atol=1e-4)
+    assert log.triggers_s is not None
+    assert np.allclose(log.triggers_s, T[::60])
+    assert log.uses_gnss
+
+
+def test_a_dataflash_log_without_position_and_one_cut_short(tmp_path: Path) -> None:
+    path = dataflash(tmp_path / "log.bin", position=False)
+    assert read_log(path).odometry is None
+    with pytest.raises(FlightError, match="holds no odometry"):
+        read_odometry(path, "ardupilot")
+    path = dataflash(tmp_path / "log.bin")
+    path.write_bytes(path.read_bytes()[:20_000])
+    part = read_log(path).odometry
+    assert part is not None
+    assert 20 < len(part.t_s) < len(T)
+    path.write_bytes(b"\x00" * 4000)
+    with pytest.raises(FlightError, match="no ArduPilot dataflash log"):
+        read_log(path)
+
+
+def test_telemetry_tells_the_flight_of_the_vehicle_that_speaks_most(tmp_path: Path) -> None:
+    log = read_log(telemetry(tmp_path / "log.tlog"))
+    check_track(log)
+    check_imu(log, 6e-4, 6e-3)
+    check_gnss(log, 0.8)
+    assert "MAVLink system 1" in log.notes[0]
+    assert log.height is not None
+    assert np.abs(log.height.agl_m - XYZ[::4, 2]).max() < 0.011
+
+
+def test_kinds_are_told_by_content(tmp_path: Path) -> None:
+    assert kind_of(px4(tmp_path / "renamed.dat")) == "ulog"
+    assert kind_of(dataflash(tmp_path / "renamed.txt")) == "ardupilot"
+    with pytest.raises(MissingInputError, match="no such file"):
+        kind_of(tmp_path / "nothing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FlightError, match=r"no flight.toml, no metadata.yaml"):
+        read_log(tmp_path / "empty")
+    (tmp_path / "words.txt").write_text("once upon a time\nthere was a log\n")
+    with pytest.raises(FlightError, match="no poses in a known format"):
+        read_log(tmp_path / "words.txt")
+
+
+@pytest.mark.parametrize(
+    ("library", "name"), [("rosbags", "x.bag"), ("pyulog", "x.ulg"), ("pymavlink", "x.bin")]
+)
+def test_a_missing_library_names_the_pip_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, name: str
+) -> None:
+    import sys
+
+    for loaded in [m for m in sys.modules if m.split(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, library, None)
+    heads = {
+        "rosbags": b"#ROSBAG V2.0\n",
+        "pyulog": b"ULog\x01\x12\x35\x01",
+        "pymavlink": b"\xa3\x95 whatever",
+    }
+    (tmp_path / name).write_bytes(heads[library])
+    with pytest.raises(InputError, match=rf"needs the package {library}: pip install 'brmgeo\[logs\]'"):
+        read_log(tmp_path / name)
