@@ -1,0 +1,682 @@
+"""The flight job through the command line: results by the letter of docs/FLIGHT.md, and everything that must be refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import geopandas as gpd
+import numpy as np
+import pyogrio
+import pytest
+import rasterio
+import rasterio.features
+import shapely
+from affine import Affine
+from pyproj import Transformer
+
+from brmgeo.errors import SettingsError
+from brmgeo.match import METHODS, GroundMap, make_matcher
+from brmgeo.match.likelihood import RateLearner
+from brmgeo.match.register import Registrar
+from pipelines import flights as job
+from pipelines.cli import cli, run
+
+CRS, LEFT, TOP, GSD, ROWS, COLS = "EPSG:5187", 195_000.0, 446_000.0, 0.5, 1000, 1200
+REAL = (
+    Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    / "flight-sheffield"
+)
+RESULTS = {
+    "candidates.geojson", "candidates.qml", "trajectory.geojson", "trajectory.gpkg", "trajectory.tum", "trajectory.json",
+    "fixes.csv", "metrics.json", "report.html",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Said:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def line(self) -> str:
+        """The one line on stderr that a refusal is; progress goes there too, and does not count."""
+        lines = [line for line in self.err.splitlines() if line.startswith("brmgeo")]
+        assert self.code == 2, self.err
+        assert len(lines) == 1, self.err
+        return lines[0]
+
+
+@pytest.fixture
+def say(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    def call(*words: object) -> Said:
+        capfd.readouterr()
+        code = run(lambda: cli([str(w) for w in words], standalone_mode=False))
+        got = capfd.readouterr()
+        return Said(code, got.out, got.err)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """600 x 500 m of houses of many sizes and turns, written with other tools than brmgeo's."""
+    folder = tmp_path_factory.mktemp("maps")
+    rng = np.random.default_rng(11)
+    boxes: list[shapely.Polygon] = []
+    while len(boxes) < 260:
+        x, y = LEFT + rng.uniform(10, 590), TOP - rng.uniform(10, 490)
+        box = shapely.box(x, y, x + rng.uniform(7, 22), y + rng.uniform(7, 13))
+        box = shapely.affinity.rotate(box, rng.uniform(0, 90))
+        if not any(box.distance(other) < 3 for other in boxes):
+            boxes.append(box)
+    gpd.GeoDataFrame({"floors": rng.integers(1, 5, len(boxes))}, geometry=boxes, crs=CRS).to_file(
+        folder / "footprints.gpkg", layer="footprints"
+    )
+    affine = Affine(GSD, 0, LEFT, 0, -GSD, TOP)
+    built = rasterio.features.rasterize(boxes, (ROWS, COLS), transform=affine, dtype="uint8")
+    profile = {"driver": "GTiff", "height": ROWS, "width": COLS, "transform": affine, "crs": CRS}
+    with rasterio.open(folder / "buildings.tif", "w", dtype="uint8", count=1, nodata=255, **profile) as dst:
+        dst.write(built, 1)
+    with rasterio.open(folder / "ratio.tif", "w", dtype="uint16", count=1, nodata=65535, **profile) as dst:
+        dst.write(built.astype(np.uint16) * 10000, 1)
+    noise = rng.integers(60, 120, (3, ROWS, COLS), dtype=np.uint8)
+    with rasterio.open(
+        folder / "imagery.tif", "w", dtype="uint8", count=3, photometric="RGB", **profile
+    ) as dst:
+        dst.write(noise + 100 * built)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def waypoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A line of 250 m within the map, in longitude and latitude."""
+    xy = [(LEFT + 200, TOP - 250), (LEFT + 350, TOP - 220), (LEFT + 380, TOP - 320)]
+    lon, lat = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(*zip(*xy, strict=True))
+    path = tmp_path_factory.mktemp("path") / "line.geojson"
+    path.write_text(
+        json.dumps({"type": "LineString", "coordinates": [list(p) for p in zip(lon, lat, strict=True)]})
+    )
+    return path
+
+
+def make_flight(maps: Path, waypoints: Path, out: Path, *words: object) -> Path:
+    given = ["simulate", "--maps", maps, "--out", out, "--path", waypoints, "--mode", "masks", *words]
+    assert run(lambda: cli([str(w) for w in given], standalone_mode=False)) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(maps: Path, waypoints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A masks-only flight of some ten frames with all that a flight has; never change it."""
+    out = tmp_path_factory.mktemp("flight") / "f"
+    return make_flight(maps, waypoints, out, "--compass", "--scale-bias", 0.03)
+
+
+@pytest.fixture(scope="module")
+def results(maps: Path, whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What localize wrote of that flight, one folder a method; never change it."""
+    out = tmp_path_factory.mktemp("results")
+    for method in METHODS:
+        words = ["localize", "--maps", maps, "--flight", whole, "--method", method, "--out", out / method]
+        assert run(lambda words=words: cli([str(w) for w in words], standalone_mode=False)) == 0
+    return out
+
+
+@pytest.fixture
+def flight(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "flight"))
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text, (path, old)
+    path.write_text(text.replace(old, new, 1))
+
+
+def rewrite_rows(path: Path, change: Callable[[list[list[str]]], list[list[str]]]) -> None:
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    path.write_text("".join(",".join(row) + "\n" for row in [rows[0], *change(rows[1:])]))
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# ---------------------------------------------------------------- what localize writes
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_result_files_agree_with_each_other(whole: Path, results: Path, method: str) -> None:
+    out = results / method
+    assert {p.name for p in out.iterdir()} == RESULTS | {"simulated-1.qgz"}
+    assert not [p for p in results.iterdir() if p.name.startswith(".")]
+
+    with open(out / "fixes.csv", newline="") as handle:
+        rows = list(csv.DictReader(handle))
+    head = [
+        "t_s",
+        "file",
+        "status",
+        "x",
+        "y",
+        "lon",
+        "lat",
+        "sigma_m",
+        "yaw_deg",
+        "heading_deg",
+        "candidates",
+        "mass",
+    ]
+    assert list(rows[0]) == head
+    frames = job.read_flight(whole).frames
+    assert [r["file"] for r in rows] == [f.file for f in frames]
+    assert {r["status"] for r in rows} <= {"converged", "ambiguous", "lost"}
+    for row in rows:
+        assert (row["x"] != "") == (row["y"] != "") == (row["lon"] != "") == (row["status"] == "converged")
+    fixed = [r for r in rows if r["status"] == "converged"]
+    to_xy = Transformer.from_crs("EPSG:4326", CRS, always_xy=True)
+    for row in fixed:
+        assert (
+            math.dist(
+                to_xy.transform(float(row["lon"]), float(row["lat"])), (float(row["x"]), float(row["y"]))
+            )
+            < 0.02
+        )
+
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["share_converged"] == pytest.approx(len(fixed) / len(rows), abs=1e-4)
+    assert metrics["method"] == method
+    assert metrics["data"] == "simulated"
+    assert metrics["seconds_per_frame"] > 0
+    reference = job.read_flight(whole).reference(CRS)
+    assert reference is not None
+    truth = {f.file: reference.at(np.array([f.t_s]))[0] for f in frames}
+    errors = np.array([math.dist((float(r["x"]), float(r["y"])), truth[r["file"]]) for r in fixed])
+    if fixed:
+        assert metrics["first_fix_s"] == pytest.approx(float(fixed[0]["t_s"]) - frames[0].t_s, abs=1e-3)
+        assert metrics["rmse_after_first_fix_m"] == pytest.approx(math.sqrt((errors**2).mean()), abs=0.01)
+    else:
+        assert metrics["first_fix_s"] is metrics["rmse_after_first_fix_m"] is None
+    assert metrics["false_fixes"] == int((errors > 50).sum()) == 0
+    if method == "mask":
+        assert fixed, "the mask matcher finds a flight over a town of 260 houses"
+        assert metrics["rmse_after_first_fix_m"] < 5
+
+    drawn = json.loads((out / "candidates.geojson").read_text())
+    assert "crs" not in drawn
+    for name in ("start", "end", "t_s", "mass", "status", "x", "y", "epsg"):
+        assert all(name in f["properties"] for f in drawn["features"][:50])
+    per_frame = np.bincount([f["properties"]["frame"] for f in drawn["features"]], minlength=len(rows))
+    counts = np.array([int(r["candidates"]) for r in rows])
+    assert (per_frame <= counts).all()
+    assert ((per_frame > 0) == (counts > 0)).all()
+
+    track = json.loads((out / "trajectory.geojson").read_text())
+    points = [f for f in track["features"] if f["geometry"]["type"] == "Point"]
+    shown = [p["geometry"]["coordinates"][:2] for p in points if p["properties"].get("status") == "converged"]
+    for row, lonlat in zip(fixed, shown, strict=False):
+        assert lonlat == pytest.approx([float(row["lon"]), float(row["lat"])], abs=2e-7)
+    assert len(pyogrio.list_layers(out / "trajectory.gpkg")) >= 2
+    tum = [line.split() for line in (out / "trajectory.tum").read_text().splitlines()]
+    assert all(len(line) == 8 for line in tum)
+    assert bool(tum) == (metrics["rmse_whole_m"] is not None)
+    assert json.loads((out / "trajectory.json").read_text())["epsg"] == 5187
+    report = (out / "report.html").read_text()
+    assert "http://" not in report.replace("http://www.w3.org", "")
+    assert "https://" not in report
+
+
+def test_same_inputs_same_bytes(maps: Path, whole: Path, results: Path, tmp_path: Path) -> None:
+    shutil.copytree(results / "mask", tmp_path / "a")
+    job.localize(maps, whole, "mask", tmp_path / "b")
+    a, b = bytes_of(tmp_path / "a"), bytes_of(tmp_path / "b")
+    assert a.keys() == b.keys()
+    timed = {"metrics.json", "report.html"}
+    # GeoPackage notes the time of its last change in two places of its own tables.
+    differ = {n for n in a if a[n] != b[n]} - timed
+    assert differ <= {"trajectory.gpkg"}, differ
+    for name in differ:
+        for layer, _ in pyogrio.list_layers(tmp_path / "a" / name):
+            ours, theirs = (pyogrio.read_dataframe(tmp_path / k / name, layer=layer) for k in "ab")
+            if layer != "layer_styles":
+                assert ours.equals(theirs), layer
+    ma, mb = json.loads(a["metrics.json"]), json.loads(b["metrics.json"])
+    assert {k for k in ma if ma[k] != mb[k]} <= {"seconds_per_frame"}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_live_matcher_and_folder_run_say_the_same(
+    maps: Path, whole: Path, results: Path, method: str
+) -> None:
+    rows = list(csv.DictReader((results / method / "fixes.csv").read_text().splitlines()))
+    ground = job.read_maps(maps).ground
+    flight = job.read_flight(whole)
+    matcher = make_matcher(method, ground, job.match_settings(job.FlightSettings()))
+    for i, (motion, row) in enumerate(zip(job.motions_of(flight), rows, strict=True)):
+        estimate = matcher.step(job.view_at(flight, ground.gsd_m, i), motion)
+        assert estimate.status == row["status"]
+        assert estimate.candidate_count == int(row["candidates"])
+        if estimate.position is not None:
+            assert estimate.position == pytest.approx(
+                (float(row["x"]), float(row["y"]), float(row["sigma_m"])), abs=1e-3
+            )
+
+
+def test_maps_need_only_two_files_and_reference_is_not_needed(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    two = tmp_path / "two"
+    two.mkdir()
+    for name in ("buildings.tif", "ratio.tif"):
+        shutil.copy(maps / name, two)
+    (flight / "reference.csv").unlink()
+    text = (flight / "flight.toml").read_text()
+    (flight / "flight.toml").write_text(text[: text.index("[reference]")])
+    out = tmp_path / "out"
+    said = say("localize", "--maps", two, "--flight", flight, "--out", out)
+    assert said.code == 0, said.err
+    assert {p.name for p in out.iterdir()} == (RESULTS - {"metrics.json"}) | {"simulated-1.qgz"}
+    (two / "ratio.tif").unlink()
+    said = say("localize", "--maps", two, "--flight", flight, "--out", tmp_path / "none")
+    assert "ratio.tif is not there" in said.line
+    assert not (tmp_path / "none").exists()
+
+
+def test_reference_is_not_read_while_estimating(
+    maps: Path, flight: Path, results: Path, tmp_path: Path
+) -> None:
+    shifted = [line.split(",") for line in (flight / "reference.csv").read_text().splitlines()]
+    text = "\n".join(",".join([t, x if x == "x" else str(float(x) + 70), y]) for t, x, y in shifted)
+    (flight / "reference.csv").write_text(text + "\n")
+    job.localize(maps, flight, "mask", tmp_path / "b")
+    assert (results / "mask/fixes.csv").read_bytes() == (tmp_path / "b/fixes.csv").read_bytes()
+    metrics = json.loads((tmp_path / "b/metrics.json").read_text())
+    assert metrics["false_fixes"] > 0
+    assert metrics["rmse_after_first_fix_m"] == pytest.approx(70, abs=5)
+
+
+def without_odometry(flight: Path) -> None:
+    text = (flight / "flight.toml").read_text()
+    (flight / "flight.toml").write_text(text[: text.index("[odometry]")] + text[text.index("[height]") :])
+    (flight / "odometry.tum").unlink()
+
+
+def statuses(ground: GroundMap, flight_dir: Path, method: str) -> set[str]:
+    flight = job.read_flight(flight_dir)
+    views = [job.view_at(flight, ground.gsd_m, i) for i in range(len(flight.frames))]
+    settings = job.match_settings(job.FlightSettings())
+    located = job.locate(ground, views, job.motions_of(flight), method, settings)
+    return {e.status for e in located.estimates}
+
+
+def test_without_odometry_nothing_false_is_said(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    without_odometry(flight)
+    words = ("--compass", "--max-speed", "8")
+    said = say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "out", *words)
+    assert said.code == 0, said.err
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["odometry"] == "none"
+    assert metrics["odometry_rmse_m"] is None
+    assert metrics["false_fixes"] == 0
+    assert metrics["settings"]["odometry"]["max_speed_m_s"] == 8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_flight_over_another_town_has_no_fix(maps: Path, whole: Path, method: str) -> None:
+    ground = job.read_maps(maps).ground
+    # Mirrored, the town is as built up as before but nowhere alike.
+    other = replace(ground, building=np.ascontiguousarray(ground.building[:, ::-1]))
+    assert "converged" not in statuses(other, whole, method)
+
+
+def test_a_single_frame_is_a_flight(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    rewrite_rows(flight / "frames.csv", lambda rows: rows[:1])
+    said = say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "out")
+    assert said.code == 0, said.err
+    assert len((tmp_path / "out/fixes.csv").read_text().splitlines()) == 2
+    ground = job.read_maps(maps).ground
+    for method in METHODS:
+        assert len(statuses(ground, flight, method)) == 1
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+def swap_times(rows: list[list[str]]) -> list[list[str]]:
+    rows[2][0], rows[3][0] = rows[3][0], rows[2][0]
+    return rows
+
+
+def cell(row: int, column: int, value: str) -> Callable[[list[list[str]]], list[list[str]]]:
+    def change(rows: list[list[str]]) -> list[list[str]]:
+        rows[row][column] = value
+        return rows
+
+    return change
+
+
+def other_mask(flight: Path) -> None:
+    import cv2
+
+    path = flight / "masks" / "frame_00002.png"
+    cv2.imwrite(str(path), np.zeros((100, 100), np.uint8))
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "time goes back": (lambda f: rewrite_rows(f / "frames.csv", swap_times), "frames.csv"),
+    "time missing": (lambda f: rewrite_rows(f / "frames.csv", cell(1, 0, "")), "frames.csv"),
+    "time NaN": (lambda f: rewrite_rows(f / "frames.csv", cell(1, 0, "nan")), "frames.csv"),
+    "height zero": (lambda f: rewrite_rows(f / "frames.csv", cell(2, 2, "0")), "agl_m"),
+    "height absurd": (lambda f: rewrite_rows(f / "frames.csv", cell(2, 2, "99999")), "agl_m"),
+    "a mask is missing": (lambda f: (f / "masks/frame_00003.png").unlink(), "frame_00003.png is missing"),
+    "no masks": (lambda f: shutil.rmtree(f / "masks"), "missing"),
+    "mask unreadable": (lambda f: (f / "masks/frame_00003.png").write_bytes(b"no picture"), "frame_00003.png"),
+    "mask of other size": (other_mask, "100 x 100"),
+    "quaternion": (
+        lambda f: (f / "odometry.tum").write_text("0 0 0 0 0 0 0 2\n5 1 0 0 0 0 0 2\n"),
+        "odometry.tum",
+    ),
+    "odometry NaN": (lambda f: (f / "odometry.tum").write_text("0 nan 0 0 0 0 0 1\n5 1 0 0 0 0 0 1\n"), "odometry.tum"),
+    "odometry of another flight": (
+        lambda f: (f / "odometry.tum").write_text("1e6 0 0 0 0 0 0 1\n1000005 1 0 0 0 0 0 1\n"),
+        "another flight",
+    ),
+    "reference in another CRS": (
+        lambda f: edit(f / "flight.toml", 'crs = "EPSG:5187"', 'crs = "EPSG:4326"'),
+        "reference.csv",
+    ),
+    "reference CRS unknown": (
+        lambda f: edit(f / "flight.toml", 'crs = "EPSG:5187"', 'crs = "EPSG:999999"'),
+        "999999",
+    ),
+    "no flight.toml": (lambda f: (f / "flight.toml").unlink(), "flight.toml"),
+    "a key that nobody knows": (lambda f: edit(f / "flight.toml", "width", "widht"), "width"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_flights_are_refused_in_one_line_and_the_old_results_stay(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], case: str
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "fixes.csv").write_text("of an earlier run\n")
+    spoil, words = BAD[case]
+    spoil(flight)
+    said = say("localize", "--maps", maps, "--flight", flight, "--out", out)
+    assert words in said.line
+    assert bytes_of(out) == {"fixes.csv": b"of an earlier run\n"}
+    assert {p.name for p in tmp_path.iterdir()} == {"out", "flight"}
+
+
+def test_frames_without_masks_need_masks(
+    maps: Path, waypoints: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    flight = make_flight(maps, waypoints, tmp_path / "f", "--mode", "frames")
+    assert (
+        "no building masks"
+        in say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "o").line
+    )
+    assert not (tmp_path / "o").exists()
+
+
+def test_commands_refuse_what_cannot_be(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], waypoints: Path
+) -> None:
+    out = tmp_path / "out"
+    common = ("localize", "--maps", maps, "--flight", flight, "--out", out)
+    assert say(*common, "--method", "guess").code == 2
+    with pytest.raises(SettingsError, match="METHOD 'guess'"):
+        job.localize(maps, flight, "guess", out)
+    rewrite_rows(flight / "frames.csv", lambda rows: [r[:5] for r in rows])
+    edit(flight / "frames.csv", ",yaw_deg", "")
+    assert "no column yaw_deg" in say(*common, "--compass").line
+    assert "either a REGION" in say("localize", "--flight", flight, "--out", out).line
+    assert "give --out" in say("localize", "--maps", maps, "--flight", flight).line
+    assert "give --flight" in say("localize", "--maps", maps, "--out", out).line
+    assert (
+        "no such folder" in say("localize", "--maps", maps, "--flight", tmp_path / "none", "--out", out).line
+    )
+    assert "buildings.tif" in say("localize", "--maps", tmp_path, "--flight", flight, "--out", out).line
+
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with rasterio.open(maps / "buildings.tif") as source:
+        for name in ("buildings.tif", "ratio.tif"):
+            with rasterio.open(empty / name, "w", **source.profile) as dst:
+                dst.write(np.zeros((ROWS, COLS), np.uint8), 1)
+    assert "no building" in say("localize", "--maps", empty, "--flight", flight, "--out", out).line
+    assert not out.exists()
+
+    simulate = ("simulate", "--maps", maps, "--out", tmp_path / "s")
+    assert "rectangel" in say(*simulate, "--path", "rectangel").line
+    assert "GeoJSON" in say(*simulate, "--path", maps / "ratio.tif").line
+    assert "--name" in say(*simulate, "--count", 2, "--name", "n").line
+    assert "generated REGION" in say(*simulate, "--season", "winter").line
+    assert "footprints.gpkg" in say("simulate", "--maps", empty, "--out", tmp_path / "s").line
+    assert not (tmp_path / "s").exists()
+
+
+def test_folders_with_other_files_are_never_replaced(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], waypoints: Path
+) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("years of work")
+    for words in (
+        ("localize", "--maps", maps, "--flight", flight, "--out", mine),
+        ("simulate", "--maps", maps, "--mode", "masks", "--path", waypoints, "--out", mine),
+    ):
+        assert "other files" in say(*words).line
+    assert bytes_of(mine) == {"thesis.txt": b"years of work"}
+
+
+def test_a_crash_while_writing_leaves_the_old_results(
+    maps: Path, whole: Path, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(results / "paper", out)
+    before = bytes_of(out)
+
+    def crash(*_: object, **__: object) -> str:
+        raise OSError("disk on fire")
+
+    monkeypatch.setattr(job, "render_report", crash)
+    with pytest.raises(OSError, match="fire"):
+        job.localize(maps, whole, "mask", out)
+    assert bytes_of(out) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+# ---------------------------------------------------------------- simulate and evaluate
+
+
+def test_simulate_gives_the_same_bytes_and_counts_seeds(
+    maps: Path, waypoints: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    words = ("simulate", "--maps", maps, "--path", waypoints)
+    for name in "ab":
+        assert say(*words, "--mode", "both", "--seed", 3, "--out", tmp_path / name).code == 0
+    both = bytes_of(tmp_path / "a")
+    assert both == bytes_of(tmp_path / "b")
+    assert {
+        "flight.toml",
+        "frames.csv",
+        "odometry.tum",
+        "imu.csv",
+        "altimeter.csv",
+        "reference.csv",
+    } <= both.keys()
+    assert any(n.startswith("frames/") for n in both)
+    assert any(n.startswith("masks/") for n in both)
+
+    said = say(*words, "--mode", "masks", "--seed", 3, "--count", 2, "--out", tmp_path / "many")
+    assert said.code == 0
+    assert sorted(p.name for p in (tmp_path / "many").iterdir()) == ["simulated-3", "simulated-4"]
+    assert say(*words, "--mode", "masks", "--seed", 4, "--out", tmp_path / "four").code == 0
+    assert bytes_of(tmp_path / "four") == bytes_of(tmp_path / "many/simulated-4")
+    assert bytes_of(tmp_path / "four") != bytes_of(tmp_path / "many/simulated-3")
+    assert say(*words, "--no-odometry", "--mode", "masks", "--out", tmp_path / "none").code == 0
+    assert not (tmp_path / "none/odometry.tum").exists()
+    assert job.read_flight(tmp_path / "none").odometry is None
+
+
+@pytest.mark.parametrize("path", job.PATHS)
+def test_named_paths_stay_on_the_map(maps: Path, path: str) -> None:
+    built = job.read_maps(maps)
+    assert built.footprints is not None
+    for seed in range(3):
+        try:
+            route = job.flight_path(path, job.read_ground(built.footprints), seed, built.bounds, built.crs)
+        except job.InputError as error:
+            assert "does not fit" in str(error)  # noqa: PT017
+            continue
+        left, bottom, right, top = built.bounds
+        assert ((route >= [left, bottom]) & (route <= [right, top])).all()
+
+
+def test_evaluate_writes_the_table_and_compares_results(
+    maps: Path, waypoints: Path, results: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    out = tmp_path / "table"
+    words = (
+        "evaluate",
+        "--maps",
+        maps,
+        "--flights",
+        2,
+        "--path",
+        waypoints,
+        "--methods",
+        "mask,paper",
+        "--out",
+        out,
+    )
+    said = say(*words)
+    assert said.code == 0, said.err
+    rows = list(csv.DictReader((out / "flights.csv").read_text().splitlines()))
+    assert [(r["seed"], r["method"]) for r in rows] == [
+        ("1", "mask"),
+        ("1", "paper"),
+        ("2", "mask"),
+        ("2", "paper"),
+    ]
+    assert {
+        "first_fix_m",
+        "rmse_whole_m",
+        "rmse_after_first_fix_m",
+        "false_fixes",
+        "odometry_rmse_m",
+    } <= rows[0].keys()
+    assert rows[0]["odometry_rmse_m"] == rows[1]["odometry_rmse_m"] != ""
+    text = (out / "summary.md").read_text()
+    table = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(table) == 4
+    assert len({line.count("|") for line in table}) == 1
+    assert "mask" in said.out
+    assert "paper" in said.out
+    assert "method 'x'" in say(*words[:-4], "--methods", "mask,x", "--out", out).line
+
+    shutil.copytree(results, tmp_path / "results")
+    said = say("evaluate", "--results", tmp_path / "results", "--out", tmp_path / "compared")
+    assert said.code == 0, said.err
+    rows = list(csv.DictReader((tmp_path / "compared/flights.csv").read_text().splitlines()))
+    for row in rows:
+        metrics = json.loads((tmp_path / "results" / row["method"] / "metrics.json").read_text())
+        assert float(row["odometry_rmse_m"]) == pytest.approx(metrics["odometry_rmse_m"], abs=1e-3)
+        assert row["false_fixes"] == str(metrics["false_fixes"])
+    assert {r["method"] for r in rows} == set(METHODS)
+    (tmp_path / "results/mask/metrics.json").write_text("{}")
+    assert "metrics.json" in say("evaluate", "--results", tmp_path / "results").line
+    assert "no metrics.json" in say("evaluate", "--results", tmp_path / "compared").line
+
+
+def test_hidden_half_of_the_map_is_never_found(maps: Path, tmp_path: Path) -> None:
+    built = job.read_maps(maps)
+    for side in ("east", "west", "north", "south"):
+        kept, (left, bottom, right, top) = job._half_hidden(built, side)
+        rows, cols = kept.building.shape
+        kept_box = shapely.box(
+            kept.left, kept.top - rows * kept.gsd_m, kept.left + cols * kept.gsd_m, kept.top
+        )
+        assert not kept_box.intersects(shapely.box(left, bottom, right, top))
+        assert rows * cols == ROWS * COLS // 2
+        row, col = round((TOP - kept.top) / GSD), round((kept.left - LEFT) / GSD)
+        assert (kept.building == built.ground.building[row : row + rows, col : col + cols]).all()
+
+
+# ---------------------------------------------------------------- the real flight
+
+
+@pytest.fixture(scope="module")
+def real_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not REAL.is_dir():
+        pytest.skip("the real flight is not here (BRMGEO_REAL_DATA)")
+    out = tmp_path_factory.mktemp("real") / "maps"
+    words = ["maps", "--footprints", REAL / "footprints.gpkg", "--crs", "EPSG:32617", "--out", out]
+    words += ["--scheduler", "serial"]
+    assert run(lambda: cli([str(w) for w in words], standalone_mode=False)) == 0
+    return out
+
+
+def registered(maps_dir: Path, pitch_off_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) metres between each frame registered from the reference and the reference, and (n,) log ratios."""
+    maps, flight = job.read_maps(maps_dir), job.read_flight(REAL)
+    reference = flight.reference(maps.crs)
+    assert reference is not None
+    truth = reference.at(flight.times_s)
+    yaws = flight.compass_yaw_rad(maps.crs, *truth[0])
+    mount = replace(flight.mount, pitch_rad=flight.mount.pitch_rad + math.radians(pitch_off_deg))
+    flight = replace(flight, mount=mount)
+    settings = job.match_settings(job.FlightSettings())
+    rates, registrar = RateLearner(settings.rates).rates, Registrar(maps.ground)
+    apart, fits = [], []
+    for i, (xy, yaw) in enumerate(zip(truth, yaws, strict=True)):
+        view = job.view_at(flight, maps.ground.gsd_m, i)
+        if view.building.sum() * view.gsd_m**2 < 20.0:
+            continue
+        assert yaw is not None
+        found = registrar.register(view, np.array([*xy, yaw]), 10.0, 0.1, rates)
+        assert found is not None, i
+        apart.append(math.dist(found.pose[:2], xy))
+        fits.append(found.llr)
+    return np.array(apart), np.array(fits)
+
+
+def test_every_real_frame_with_buildings_registers_on_the_map(real_maps: Path) -> None:
+    apart, fits = registered(real_maps, 0.0)
+    assert len(apart) >= 75
+    assert np.median(apart) < 1.0
+    assert apart.max() < 5.0
+    assert (fits > 0).all()
+    wrong_apart, wrong_fits = registered(real_maps, 5.0)
+    assert np.median(wrong_apart) > 4.0
+    assert np.median(wrong_fits) < np.median(fits) - 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [(), ("--compass",), ("--compass", "--max-speed", "8")])
+def test_real_flight_without_odometry_is_honest(
+    real_maps: Path, tmp_path: Path, say: Callable[..., Said], words: tuple[str, ...]
+) -> None:
+    out = tmp_path / "out"
+    said = say("localize", "--maps", real_maps, "--flight", REAL, "--out", out, *words)
+    assert said.code == 0, said.err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["data"] == "as given"
+    assert metrics["false_fixes"] == 0
+    if "--max-speed" in words:
+        assert metrics["share_converged"] > 0.1
+        assert metrics["rmse_after_first_fix_m"] < 1.0
