@@ -46,7 +46,7 @@ class Condition:
     name: str
     says: str
     buildings: str = ""  # "", "town" or "towers": with the simulator's renderer
-    hz: float = 10.0
+    hz: float = 5.0
     delay_s: float = 0.0
     boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     agl_bias_m: float = 0.0
@@ -60,10 +60,10 @@ class Condition:
 
 BENT = Camera(640, 480, 610.0, 610.0, 318.0, 241.5, (-0.12, 0.05, 0.0004, -0.0003, 0.0))
 CONDITIONS = [
-    Condition("flat", "flat ground, 10 Hz"),
+    Condition("flat", "flat ground, 10 Hz", hz=10.0),
+    Condition("30 Hz", "thirty frames a second", hz=30.0),
     Condition("2 Hz", "two frames a second", hz=2.0),
-    Condition("5 Hz", "", hz=5.0),
-    Condition("30 Hz", "", hz=30.0),
+    Condition("5 Hz", "five, as in all rows below"),
     Condition("distortion", "lens bends corners by 20 px", flight={"camera": BENT}),
     Condition("oblique", "camera 15 deg ahead of nadir", flight={"mount": Attitude(0.0, -math.radians(15.0))}),
     Condition("low texture", "contrast 1/8", contrast=0.125),
@@ -79,10 +79,10 @@ CONDITIONS = [
     Condition("blind 10 s", "no frames for 10 s", blind_s=(100.0, 110.0)),
     Condition("rolling shutter", "rows read over 20 ms", rolling_s=0.02),
     Condition("terrain", "smooth hills, +-10 m over 300 m; AGL follows", hills_m=10.0),
-    Condition("town", "buildings 3-20 m, 5 Hz", hz=5.0, buildings="town"),
-    Condition("town, all points", "the same without slowest layer", hz=5.0, buildings="town", vio={"slowest_layer": False}),
-    Condition("towers", "a third 40-60 m high, 5 Hz", hz=5.0, buildings="towers"),
-    Condition("towers, all points", "the same without slowest layer", hz=5.0, buildings="towers", vio={"slowest_layer": False}),
+    Condition("town", "buildings 3-20 m", buildings="town"),
+    Condition("town, all points", "the same without slowest layer", buildings="town", vio={"slowest_layer": False}),
+    Condition("towers", "a third 40-60 m high", buildings="towers"),
+    Condition("towers, all points", "the same without slowest layer", buildings="towers", vio={"slowest_layer": False}),
 ]  # fmt: skip
 
 
@@ -99,7 +99,9 @@ def place_of(seed: int, extent: tuple[float, float, float, float]) -> Any:
     return rectangle((float(centre[0]), float(centre[1])), float(rng.uniform(0, 360)), 1081.0)
 
 
-def draw_flat(course: Course, settings: FlightSettings, imagery: Imagery, condition: Condition, seed: int) -> Iterator[Any]:
+def draw_flat(
+    course: Course, settings: FlightSettings, imagery: Imagery, condition: Condition, seed: int
+) -> Iterator[Any]:
     """Grey frames of the imagery on flat ground (or on hills), through lens, shutter, contrast and noise."""
     camera = settings.camera
     rng = np.random.default_rng([seed, 5])
@@ -107,7 +109,9 @@ def draw_flat(course: Course, settings: FlightSettings, imagery: Imagery, condit
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = ray_from_pixel(camera, np.stack([u, v], -1)).astype(np.float32)
     # Noise is drawn once and shifted: drawing it anew would be most of the time.
-    noise = (rng.standard_normal((camera.height + 64, camera.width + 64)) * settings.noise_levels).astype(np.float32)
+    noise = (rng.standard_normal((camera.height + 64, camera.width + 64)) * settings.noise_levels).astype(
+        np.float32
+    )
     bore = Attitude(*(math.radians(a) for a in condition.boresight_deg)).matrix()
     shutter = np.linspace(-0.5, 0.5, 9) * settings.exposure_s if settings.exposure_s else [0.0]
     late = np.linspace(0.0, condition.rolling_s, camera.height) if condition.rolling_s else None
@@ -152,13 +156,23 @@ def _homography(course: Course, settings: FlightSettings, imagery: Imagery, bore
     inverse = np.linalg.inv(np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]]))
     ground = np.array([[place[2], 0, -place[0]], [0, place[2], -place[1]], [0, 0, -1.0]])
     to_image = np.array(
-        [[1, 0, -imagery.left - imagery.gsd_m / 2], [0, -1, imagery.top - imagery.gsd_m / 2], [0, 0, imagery.gsd_m]]
+        [
+            [1, 0, -imagery.left - imagery.gsd_m / 2],
+            [0, -1, imagery.top - imagery.gsd_m / 2],
+            [0, 0, imagery.gsd_m],
+        ]
     )
     return to_image @ ground @ cam @ inverse
 
 
 def _footpoints(
-    course: Course, settings: FlightSettings, imagery: Imagery, rays: Any, bore: Any, when: float, condition: Condition
+    course: Course,
+    settings: FlightSettings,
+    imagery: Imagery,
+    rays: Any,
+    bore: Any,
+    when: float,
+    condition: Condition,
 ) -> tuple[Any, Any]:
     (x, y, z), cam = _camera_at(course, settings, bore, when)
     world = rays @ cam.T.astype(np.float32)
@@ -173,7 +187,11 @@ def _footpoints(
 
 def hill(condition: Condition, x: Any, y: Any) -> Any:
     """Height of the ground, metres: waves of 300 m."""
-    return condition.hills_m * np.sin(np.asarray(x) * (2 * np.pi / 300.0)) * np.cos(np.asarray(y) * (2 * np.pi / 300.0))
+    return (
+        condition.hills_m
+        * np.sin(np.asarray(x) * (2 * np.pi / 300.0))
+        * np.cos(np.asarray(y) * (2 * np.pi / 300.0))
+    )
 
 
 def heights_of(n: int, kind: str) -> Any:
@@ -207,7 +225,11 @@ def fly_once(condition: Condition, seed: int, imagery: Imagery, ground: Any) -> 
     rng = np.random.default_rng([seed, 6])
     truth = course.xyz_m[course.frame_index]
     times = course.frame_times_s
-    agl = truth[:, 2] + settings.agl_error_m * (rng.normal() + rng.normal(size=len(times))) + condition.agl_bias_m
+    agl = (
+        truth[:, 2]
+        + settings.agl_error_m * (rng.normal() + rng.normal(size=len(times)))
+        + condition.agl_bias_m
+    )
     spent = [0.0]
     keep = np.ones(len(times), dtype=bool)
     if condition.blind_s is not None:
@@ -221,7 +243,13 @@ def fly_once(condition: Condition, seed: int, imagery: Imagery, ground: Any) -> 
                 spent[0] += time.process_time() - begin
 
     result = run_vio(
-        times[keep], watched(), agl[keep], imu, settings.camera, settings.mount, replace(VioSettings(), **condition.vio)
+        times[keep],
+        watched(),
+        agl[keep],
+        imu,
+        settings.camera,
+        settings.mount,
+        replace(VioSettings(), **condition.vio),
     )
     return score(result, truth[keep], course.roll_pitch_yaw[course.frame_index][keep, 2], spent[0])
 
@@ -252,7 +280,9 @@ def score(result: VioResult, truth: Any, yaw: Any, seconds: float) -> dict[str, 
     own = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
     turn = yaw[0] - own[0]
     c, s = math.cos(turn), math.sin(turn)
-    xy = (result.odometry.xyz_m[:, :2] - result.odometry.xyz_m[0, :2]) @ np.array([[c, s], [-s, c]]) + truth[0, :2]
+    xy = (result.odometry.xyz_m[:, :2] - result.odometry.xyz_m[0, :2]) @ np.array([[c, s], [-s, c]]) + truth[
+        0, :2
+    ]
     error = np.hypot(*(xy - truth[:, :2]).T)
     heading = np.degrees(np.angle(np.exp(1j * (own + turn - yaw))))
     steps = np.linalg.norm(np.diff(truth[:, :2], axis=0), axis=1)
@@ -298,11 +328,15 @@ def read_demo() -> tuple[Imagery, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help="conditions (default: all)")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--results", type=Path, help="JSON lines: what is there is not flown again, new rows are added.")
+    parser.add_argument(
+        "--results", type=Path, help="JSON lines: what is there is not flown again, new rows are added."
+    )
     parser.add_argument("--write", action="store_true", help="Write the table to docs/odometry.md.")
     given = parser.parse_args()
     cv2.setNumThreads(1)

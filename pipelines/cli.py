@@ -533,6 +533,32 @@ def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, writ
             click.echo(line)
 
 
+@cli.command()
+@click.argument("flight", type=DATA)
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "vio", "planar"]),
+    default="auto",
+    show_default=True,
+    help="vio: frames, IMU and height; planar: frames, attitude and height.",
+)
+@click.option(
+    "--thin",
+    type=DATA,
+    help="Also write the flight with its odometry and only every --every seconds a frame, for localize.",
+)
+@click.option("--every", "every_s", type=float, default=5.0, show_default=True, help="Seconds, with --thin.")
+def odometry(flight: Path, method: str, thin: Path | None, every_s: float) -> None:
+    """Make the odometry of FLIGHT (a folder) from its own frames, IMU and height, and write it there."""
+    from pipelines import odometry as job
+
+    facts = job.make_odometry(flight, job.method_named(method))
+    for line in job.summary(facts):
+        click.echo(line)
+    if thin is not None:
+        click.echo(f"wrote {job.thin_flight(flight, thin, every_s)}")
+
+
 def main() -> None:
     """Entry point of the ``brmgeo`` command."""
     sys.exit(run(lambda: cli(standalone_mode=False)))

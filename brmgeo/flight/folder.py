@@ -10,7 +10,7 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -35,7 +35,7 @@ _KEYS: dict[str, dict[str, type]] = {
     | dict.fromkeys(("fov_deg", "fx", "fy", "cx", "cy"), float),
     "mount": {"roll_deg": float, "pitch_deg": float, "yaw_deg": float},
     "frames": {"video": str, "start_s": float},
-    "odometry": {"file": str, "format": str, "quaternion": str, "topic": str},
+    "odometry": {"file": str, "format": str, "quaternion": str, "topic": str, "covariance": str},
     "height": {"source": str, "fixed_m": float},
     "altimeter": {"file": str, "datum": str, "ground_m": float},
     "reference": {"file": str, "crs": str},
@@ -578,6 +578,8 @@ def _odometry(
     body = mount.body_from_camera()
     level = Attitude(frames[0].roll_rad, frames[0].pitch_rad).matrix() @ body
     odometry = read_odometry(path, format_name, OdometryOptions(order, times, level, body, topic))
+    if toml.has("odometry", "covariance"):
+        odometry = _covariance(folder / toml.text("odometry", "covariance"), odometry)
     _check_overlap(path, "odometry", odometry.t_s, times)
     _, x, y, _ = odometry.wxyz.T
     tilt = float(np.median(np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))))
@@ -587,6 +589,29 @@ def _odometry(
             "body (x nose, y left, z up) in a frame with z up: check quaternion (xyzw or wxyz) in [odometry], or turn them"
         )
     return odometry
+
+
+def _covariance(path: Path, odometry: Odometry) -> Odometry:
+    # What `brmgeo odometry` writes beside its track: one row a pose.
+    table = read_table(path, [("t_s", "walk_m2")], ["segment", "yaw_sigma_deg", "tracks", "blind"])
+    table.check_times()
+    times = table.numbers["t_s"]
+    if len(times) != len(odometry.t_s) or np.abs(times - odometry.t_s).max(initial=0.0) > 1e-3:
+        raise refuse(
+            path,
+            None,
+            None,
+            f"{len(times)} rows that do not belong to the {len(odometry.t_s)} poses of {odometry.source}: "
+            "run brmgeo odometry again, or remove 'covariance' from [odometry]",
+        )
+    walk = table.numbers["walk_m2"]
+    falling = np.flatnonzero(np.diff(walk, prepend=0.0) < 0.0)
+    if falling.size:
+        raise refuse(path, table.lines[int(falling[0])], "walk_m2", "the gathered variance falls: it can only grow")
+    segment = table.numbers.get("segment")
+    return replace(
+        odometry, walk_m2=walk, segment=odometry.segment if segment is None else segment.astype(np.int64)
+    )
 
 
 def _check_overlap(path: Path, what: str, t: FloatArray, times: FloatArray) -> None:

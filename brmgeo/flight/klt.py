@@ -120,7 +120,7 @@ class KltTracker:
         return bool(np.median(moved) > self.settings.reanchor_px)
 
     def refill(self) -> int:
-        """Anchor all points in the newest frame and find new ones where there are few; the number of new ones, at the end."""
+        """Anchor all points in the newest frame and find new ones where there are few; how many, at the end, are new."""
         assert self._now is not None
         s = self.settings
         height, width = self._now.shape

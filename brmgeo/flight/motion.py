@@ -16,6 +16,8 @@ from brmgeo.flight.values import Motion
 
 #: Standard deviation of a visual-inertial step per axis after one second; it grows with the root of time.
 STEP_NOISE_M = 0.1
+#: Not even a step that the odometry is sure of is better than this.
+MIN_STEP_NOISE_M = 0.02
 
 
 def yaw_of(wxyz: FloatArray) -> FloatArray:
@@ -73,7 +75,8 @@ def motions(
         frame_times_s: (n,) float64, increasing.
         compass_yaw_rad: (n,) yaw in the map frame from a trusted compass, or None.
         max_gap_s, max_speed_m_s: see ``breaks``.
-        step_noise_m: standard deviation of a step of one second per axis; ``sigma_m`` grows with the root of time.
+        step_noise_m: standard deviation of a step of one second per axis; ``sigma_m`` grows with the root of time. An
+            odometry that says itself what its steps are worth (``walk_m2``) is believed instead.
 
     The first Motion has ``dt_s`` 0 and no step. A step is None outside the track and across a gap or reset; the yaw
     is None outside the track and within a gap. After a reset the yaw may be counted from a new origin.
@@ -96,6 +99,8 @@ def motions(
     else:
         yaw = np.repeat(yaw_of(odometry.wxyz), n)
 
+    walk = None if odometry.walk_m2 is None else np.interp(times, t, odometry.walk_m2)
+
     starts, ends = breaks(odometry, max_gap_s, max_speed_m_s)
     # Breaks come in order and do not overlap: count those a time lies beyond, and whether it is within one.
     begun = np.searchsorted(starts, times - tolerance, side="left")
@@ -115,6 +120,10 @@ def motions(
             and ended[i] == ended[i - 1]
         ):
             step = xy[i] - xy[i - 1]
-        sigma = step_noise_m * float(np.sqrt(max(dt[i], 0.0))) if step is not None else 0.0
+        sigma = 0.0
+        if step is not None:
+            sigma = step_noise_m * float(np.sqrt(max(dt[i], 0.0)))
+            if walk is not None:
+                sigma = float(np.sqrt(max(walk[i] - walk[i - 1], MIN_STEP_NOISE_M**2)))
         out.append(Motion(float(dt[i]), step, float(yaw[i]) if have_yaw else None, sigma, compass[i]))
     return out

@@ -146,7 +146,9 @@ def run_planar(
     for row, grey in enumerate(images):
         if last is not None and times_s[row] - times_s[last.row] < s.min_interval_s:
             continue
-        shot = _look(sift, grey, row, float(agl_m[row]), float(roll_rad[row]), float(pitch_rad[row]), camera, mount)
+        shot = _look(
+            sift, grey, row, float(agl_m[row]), float(roll_rad[row]), float(pitch_rad[row]), camera, mount
+        )
         found, joined = 0, True
         walk = walk_last
         if key is not None and last is not None:
@@ -159,7 +161,9 @@ def run_planar(
                 move = step[1]
                 shot.place = base.place + [c * move[0] - n * move[1], n * move[0] + c * move[1]]
                 shot.yaw = base.yaw + step[0]
-                fast = np.hypot(*(shot.place - last.place)) > s.max_speed_m_s * (times_s[row] - times_s[last.row])
+                fast = np.hypot(*(shot.place - last.place)) > s.max_speed_m_s * (
+                    times_s[row] - times_s[last.row]
+                )
                 joined = not fast
                 found = step[2]
                 walk = walk_key + step[3]
@@ -180,8 +184,12 @@ def run_planar(
     at = np.array(rows, dtype=np.int64)
     quaternions = np.array([_wxyz(roll_rad[r], pitch_rad[r], y) for r, y in zip(rows, yaws)])
     xyz = np.concatenate([np.array(places), np.asarray(agl_m)[at][:, None]], axis=1)
-    odometry = Odometry(np.asarray(times_s)[at], xyz, quaternions, "embedded planar odometry", np.array(segments))
-    return PlanarResult(odometry, at, np.maximum.accumulate(np.array(walks)), np.array(counts, dtype=np.int64))
+    odometry = Odometry(
+        np.asarray(times_s)[at], xyz, quaternions, "embedded planar odometry", np.array(segments)
+    )
+    return PlanarResult(
+        odometry, at, np.maximum.accumulate(np.array(walks)), np.array(counts, dtype=np.int64)
+    )
 
 
 def _look(

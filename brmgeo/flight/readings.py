@@ -106,6 +106,8 @@ class Odometry:
         source: the file's name, for messages and results.
         segment: (n,) int64 that grows wherever the source says it was reset: no motion is taken across. None: nothing
             is said.
+        walk_m2: (n,) float64, never falling: variance per axis that the steps have gathered, without heading and
+            scale; between two poses it is the difference. None: nothing is said.
     """
 
     t_s: FloatArray
@@ -113,6 +115,7 @@ class Odometry:
     wxyz: FloatArray
     source: str = ""
     segment: NDArray[np.int64] | None = None
+    walk_m2: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
