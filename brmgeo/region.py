@@ -259,7 +259,9 @@ def load_region(path: Path) -> Region:
         raise MissingInputError(
             f"{path}: there is no region {path.stem!r}; {hint} `brmgeo new-region {path.stem} --sheets ...` writes one"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise SettingsError(f"{path}: is not UTF-8 text, as TOML must be: save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{path}: not valid TOML: {error}") from None
     except OSError as error:
         raise SettingsError(f"{path}: cannot be read: {error.strerror}") from None

@@ -386,9 +386,9 @@ def _missing_message(source: TileSource, missing: Sequence[Tile], wanted: int, o
         f"{len(missing)} of {wanted} tiles at level {z} of the {grid.name} grid are missing ({first}; {span})"
     )
     if origin:
-        return f"{text}: {origin}; check the level and the bounds, or raise missing_ok"
+        return f"{text}: {origin}; check the level and the bounds, or raise missing_share (missing_ok)"
     if not isinstance(source, TileFolder):
-        return f"{text} in {source.where}: get a file that covers the region, or raise missing_ok"
+        return f"{text} in {source.where}: get a file that covers the region, or raise missing_share (missing_ok)"
     template = source.template or grid.template
     text += f" under {source.root}, wanted as {template}.png, .jpg or .webp"
     if not source.root.is_dir():
@@ -406,7 +406,7 @@ def _missing_message(source: TileSource, missing: Sequence[Tile], wanted: int, o
             text += f"; it holds none{f', but {other.relative_to(source.root)}' if other else ''}"
     return (
         f"{text}; put there tiles that you may use (export them from your own tile package, or name a service or a "
-        "GeoTIFF as source in the region file), or raise missing_ok to leave them unknown"
+        "GeoTIFF as source in the region file), or raise missing_share (missing_ok) to leave them unknown"
     )
 
 
