@@ -80,7 +80,6 @@ class Maps:
         return (g.left, g.top - rows * g.gsd_m, g.left + cols * g.gsd_m, g.top)
 
 
-@functools.lru_cache(maxsize=2)
 def read_maps(folder: Path) -> Maps:
     """The maps in a folder; MissingInputError where buildings.tif or ratio.tif is not there."""
     for name in ("buildings.tif", "ratio.tif"):
@@ -88,6 +87,12 @@ def read_maps(folder: Path) -> Maps:
             raise MissingInputError(
                 f"{folder / name} is not there; build the maps first (make maps REGION=..., or brmgeo maps)"
             )
+    return _read_maps(folder, (folder / "buildings.tif").stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=2)
+def _read_maps(folder: Path, changed_ns: int) -> Maps:
+    # The time of the last change is in the key, so that maps built anew are read anew.
     path = folder / "buildings.tif"
     box = box_of(path)
     left, _, _, top = bounds_of(box)

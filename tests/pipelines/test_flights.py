@@ -465,6 +465,8 @@ def test_commands_refuse_what_cannot_be(
     assert "GeoJSON" in say(*simulate, "--path", maps / "ratio.tif").line
     assert "--name" in say(*simulate, "--count", 2, "--name", "n").line
     assert "generated REGION" in say(*simulate, "--season", "winter").line
+    for name in ("buildings.tif", "ratio.tif"):
+        shutil.copy(maps / name, empty)
     assert "footprints.gpkg" in say("simulate", "--maps", empty, "--out", tmp_path / "s").line
     assert not (tmp_path / "s").exists()
 
