@@ -41,10 +41,10 @@ evaluate: setup  ## Fly many simulated flights over REGION through all three mat
 demo: maps localize  ## Maps, a simulated flight and its report, over the embedded demo region
 
 test: setup  ## Run the tests (needs nothing but Python; real data and QGIS only where they are present)
-	$(BIN)/pytest -m "not slow" $(ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
 
 test-slow: setup  ## Run the long tests too
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)
 
 qgis-test: maps localize  ## Open the demo's QGIS projects in a real QGIS, check and render them (needs qgis, python3-qgis)
 	@/usr/bin/python3 -c 'import qgis.core' 2>/dev/null || { echo "QGIS is not installed: apt-get install qgis python3-qgis"; exit 2; }
