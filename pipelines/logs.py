@@ -735,6 +735,10 @@ def inspect_document(paths: Sequence[Path]) -> str:
         "Made by `brmgeo inspect ../shared/data/logs/* ../shared/data/photos-dji --write docs/logs.md`; the logs and",
         "their licences are listed in `../shared/data/logs/SOURCE.txt`, none is part of this project.",
         "",
+        "`brmgeo inspect PATH` tells this of any log; `brmgeo import PATH --out flight/` makes a flight folder of it",
+        "(`pip install 'brmgeo[logs]'` for ROS bags, PX4 and ArduPilot logs). FAULT is what import refuses, with the",
+        "option that mends it. A log without pictures takes them from `--photos` (by its camera triggers) or `--video`.",
+        "",
     ]
     for path in paths:
         try:

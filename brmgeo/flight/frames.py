@@ -23,8 +23,10 @@ ENU_FROM_NED: FloatArray = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 MIN_WANDER = 0.02
 #: The better order must wander less than this share of the other.
 CLEAR_SHARE = 0.67
-#: No vehicle flies like this on average.
-UPSIDE_DOWN_DEG = 150.0
+#: No vehicle flies beyond this on average, and a body that is not turned in its vehicle stays below that.
+UPSIDE_DOWN_DEG, UPRIGHT_DEG = 150.0, 60.0
+#: More wander than this is tumbling.
+MAX_WANDER = 0.2
 
 
 def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -146,6 +148,10 @@ def likely_order(values: FloatArray) -> QuaternionOrder | None:
     wander = {order: 1.0 - float(np.linalg.norm(mean)) for order, mean in up.items()}
     tilt = {order: float(np.degrees(np.arctan2(np.hypot(m[0], m[1]), m[2]))) for order, m in up.items()}
     orders: tuple[QuaternionOrder, QuaternionOrder] = ("wxyz", "xyzw")
+    for order, other in (orders, orders[::-1]):
+        # On a straight course it is leaning that wanders, in both readings; but one of them lies on its back.
+        if tilt[order] < UPRIGHT_DEG and wander[order] < MAX_WANDER and tilt[other] > UPSIDE_DOWN_DEG:
+            return order
     for order, other in (orders, orders[::-1]):
         if wander[other] > MIN_WANDER and wander[order] < CLEAR_SHARE * wander[other]:
             return order

@@ -164,6 +164,8 @@ def bag(
                 )
                 send("/fix", fix, t)
             if "range" in topics and i % 2 == 0:
+                more = "variance" in types["sensor_msgs/msg/Range"].__dataclass_fields__
+                variance = {"variance": 0.0} if more else {}
                 reach = make(
                     "sensor_msgs/msg/Range",
                     header=header(stamp, "down"),
@@ -172,8 +174,8 @@ def bag(
                     min_range=0.2,
                     max_range=200.0,
                     range=float(XYZ[i, 2]),
-                    **({} if ros1 or "variance" not in types["sensor_msgs/msg/Range"].__dataclass_fields__ else {"variance": 0.0}),
-                )  # fmt: skip
+                    **variance,
+                )
                 send("/range", reach, t)
             if "image" in topics and i % 20 == 0:
                 image = picture(i // 20)
@@ -321,7 +323,8 @@ def px4(path: Path, *, version: str = "local", **options: Any) -> Path:
             [(int(US[i]), float(LAT[i]), float(LON[i]), float(XYZ[i, 2]), 0.9, 3) for i in range(0, N, 4)],
         )
         messages["vehicle_odometry"] = (
-            "uint64_t timestamp;uint64_t timestamp_sample;uint8_t pose_frame;float[3] position;float[4] q;uint8_t reset_counter;",
+            "uint64_t timestamp;uint64_t timestamp_sample;uint8_t pose_frame;float[3] position;float[4] q;"
+            "uint8_t reset_counter;",
             [
                 (int(u) + 3000, int(u), 1, *map(float, p), *map(float, q), int(i >= 200))
                 for i, (u, p, q) in enumerate(zip(US, NED, NED_WXYZ))
@@ -355,7 +358,7 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True) -> Path
         "IMU": (131, clock + "ffffff", f"{era},GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
         "RFND": (133, clock + "f", f"{era},Dist"),
         "CAM": (134, clock + "H", f"{era},Img"),
-        "GPS": (135, clock + "BLLf" if us else "BILLfI", f"{era},Status,Lat,Lng,Alt" if us else "Status,TimeMS,Lat,Lng,Alt,T"),
+        "GPS": (135, "QBLLf", "TimeUS,Status,Lat,Lng,Alt") if us else (135, "BILLfI", "Status,TimeMS,Lat,Lng,Alt,T"),
     }  # fmt: skip
     if position:
         formats[name] = (

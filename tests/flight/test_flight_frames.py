@@ -112,6 +112,16 @@ def test_the_order_is_told_from_a_flight_that_turns(seed: int, order: str, mount
         assert told == order
 
 
+def test_a_straight_course_with_banking_is_not_taken_for_the_other_order() -> None:
+    rng = np.random.default_rng(2)
+    for bank in (0.1, 0.3):
+        lean = np.c_[rng.normal(0, 0.01, 400), rng.normal(0, 0.02, 400), rng.normal(0, bank, 400)]
+        q = wxyz(Rotation.from_euler("ZYX", lean))
+        assert frames.likely_order(q) == "wxyz"
+    q = wxyz(Rotation.from_euler("ZYX", lean / 3.0))
+    assert frames.likely_order(q[:, [1, 2, 3, 0]]) is None
+
+
 def test_the_order_is_not_told_where_nothing_tells_it() -> None:
     still = np.tile([0.5, 0.5, 0.5, 0.5], (50, 1))
     assert frames.likely_order(still) is None

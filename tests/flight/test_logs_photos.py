@@ -87,7 +87,8 @@ def test_sensefly_and_parrot_conventions(tmp_path: Path) -> None:
     for name, text in {
         "sensefly": "<Camera:Yaw>75.0</Camera:Yaw><Camera:Pitch>4.0</Camera:Pitch><Camera:Roll>-3.0</Camera:Roll>"
         "<Camera:GPSXYAccuracy>0.03</Camera:GPSXYAccuracy><Camera:AboveGroundAltitude>118.5</Camera:AboveGroundAltitude>",
-        "parrot": '<x drone-parrot:CameraRollDegree="0" drone-parrot:CameraPitchDegree="-86" drone-parrot:CameraYawDegree="75"/>',
+        "parrot": '<x drone-parrot:CameraRollDegree="0" drone-parrot:CameraPitchDegree="-86" '
+        'drone-parrot:CameraYawDegree="75"/>',
     }.items():
         folder = tmp_path / name
         folder.mkdir()

@@ -182,6 +182,8 @@ def test_px4_dropouts_are_told_and_damage_is_noted_or_refused(tmp_path: Path) ->
     part = read_log(cut)
     assert part.odometry is not None
     assert 200 < len(part.odometry.t_s) < 350
+    assert any("cut short" in note for note in part.notes)
+    assert not any("cut short" in note for note in log.notes)
     cut.write_bytes(whole[:450])
     with pytest.raises(FlightError, match=r"breaks off before its first data|no readable ULog"):
         read_log(cut)

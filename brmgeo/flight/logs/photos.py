@@ -10,7 +10,7 @@ import csv
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,8 @@ class _Photo:
     camera: Camera | None = None
     camera_from: str = ""
     make: str = ""
-    said: set[str] = field(default_factory=set)
+    turned_by: str = ""
+    listed: bool = False
 
 
 def read_photos(path: Path, options: LogOptions | None = None) -> Log:
@@ -122,13 +123,14 @@ def read_photos(path: Path, options: LogOptions | None = None) -> Log:
         values = np.array([getattr(p, name) for p in photos])
         if np.isfinite(values).all():
             height = Height(
-                t, values, above, next(iter(photos[0].said & {"XMP RelativeAltitude", "list"}), "XMP")
+                t, values, above, f"{name.replace('_', ' ')} of {'the list' if photos[0].listed else 'XMP'}"
             )
+
             break
     attitude = None
     turned = [p.wxyz for p in photos if p.wxyz is not None]
     if len(turned) == len(photos):
-        attitude = Orientation(t, np.stack(turned), True, ", ".join(sorted(photos[0].said)), of_camera=True)
+        attitude = Orientation(t, np.stack(turned), True, photos[0].turned_by, of_camera=True)
     elif turned:
         notes.append(f"{len(photos) - len(turned)} photos have no attitude, so none is used")
     camera = photos[0].camera
@@ -226,7 +228,6 @@ def _place(photo: _Photo, gps: dict[int, Any]) -> None:
         altitude = _number(gps.get(6))
         photo.alt = -altitude if below else altitude
         photo.sigma = _number(gps.get(31))
-        photo.said.add("EXIF GPS")
 
 
 def _tags(xmp: bytes | str) -> dict[str, str]:
@@ -264,12 +265,10 @@ def _inverse(wxyz: FloatArray) -> FloatArray:
 def _vendor(photo: _Photo, tags: dict[str, str]) -> None:
     if any(n.startswith("drone-dji:") for n in tags):
         photo.above_takeoff = _number(tags.get("drone-dji:RelativeAltitude"))
-        if math.isfinite(photo.above_takeoff):
-            photo.said.add("XMP RelativeAltitude")
         gimbal = _angles(tags, *(f"drone-dji:Gimbal{a}Degree" for a in ("Roll", "Pitch", "Yaw")))
         if gimbal is not None:
             photo.wxyz = _ahead(*gimbal)
-            photo.said.add("DJI gimbal")
+            photo.turned_by = "DJI gimbal"
         deviation = [_number(tags.get(f"drone-dji:RtkStd{a}")) for a in ("Lon", "Lat")]
         if all(math.isfinite(v) for v in deviation) and tags.get("drone-dji:RtkFlag", "0").strip() not in (
             "0",
@@ -280,18 +279,17 @@ def _vendor(photo: _Photo, tags: dict[str, str]) -> None:
         if math.isnan(photo.lon) and all(math.isfinite(v) for v in place):
             photo.lon, photo.lat = place
             photo.alt = _number(tags.get("drone-dji:AbsoluteAltitude"))
-            photo.said.add("XMP place")
         return
     parrot = _angles(tags, *(f"drone-parrot:Camera{a}Degree" for a in ("Roll", "Pitch", "Yaw")))
     if parrot is not None:
         photo.wxyz = _ahead(*parrot)
-        photo.said.add("Parrot camera")
+        photo.turned_by = "Parrot camera"
         return
     own = _angles(tags, "Camera:Roll", "Camera:Pitch", "Camera:Yaw")
     if own is not None:
         # Pix4D's and senseFly's zero pitch is straight down; others write that as -90.
         photo.wxyz = _ahead(*own) if own[1] < -45.0 else _down(*own)
-        photo.said.add("XMP Camera, pitch 0 = ahead" if own[1] < -45.0 else "XMP Camera, pitch 0 = down")
+        photo.turned_by = "XMP Camera, pitch 0 is " + ("ahead" if own[1] < -45.0 else "straight down")
     accuracy = _number(tags.get("Camera:GPSXYAccuracy"))
     if math.isfinite(accuracy):
         photo.sigma = accuracy
@@ -390,14 +388,14 @@ def _lists(folder: Path, photos: list[_Photo], notes: list[str]) -> None:
             photo.alt = values.get("alt", photo.alt)
             photo.sigma = values.get("sigma", photo.sigma)
             if math.isfinite(values.get("relative", math.nan)):
-                photo.above_takeoff = values["relative"]
+                photo.above_takeoff, photo.listed = values["relative"], True
             if math.isfinite(values.get("t", math.nan)):
                 photo.t_s = values["t"]
             turn = [values.get(k, math.nan) for k in ("roll", "pitch", "yaw")]
             if all(math.isfinite(v) for v in turn):
                 # An autopilot's list tells the aircraft's attitude, level at zero; a gimbal's tells -90 for down.
                 photo.wxyz = _ahead(*turn) if turn[1] < -45.0 else _down(*turn)
-            photo.said.add("list")
+                photo.turned_by = path.name
             used += 1
         if used:
             notes.append(f"{path.name}: places of {used} of {len(photos)} photos taken from this list")
@@ -428,7 +426,6 @@ def _mrk(path: Path, photos: list[_Photo], notes: list[str]) -> None:
         photo.lon = lon + east / 1000.0 / (111_320.0 * max(math.cos(math.radians(lat)), 1e-6))
         photo.alt, photo.sigma = alt, max(sn, se)
         photo.t_s = 315_964_800.0 + week * 604_800.0 + tow
-        photo.said.add("list")
         matched += 1
     if 0 < matched < len(photos):
         raise FlightError(

@@ -186,6 +186,11 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
         imu_topic = choose(
             path, "inertial readings", "--imu-topic", options.imu_topic, _counts(reader, (_IMU,)), True
         )
+        imus = _counts(reader, (_IMU,))
+        if len(imus) > 1 and options.imu_topic is None:
+            notes.append(
+                f"{imu_topic} is taken of {len(imus)} inertial streams: {', '.join(imus)} (--imu-topic)"
+            )
         fix_topic = next(iter(sorted(_counts(reader, (_FIX,)).items(), key=lambda kv: -kv[1])), (None,))[0]
         range_topic = next(iter(_counts(reader, (_RANGE,))), None)
         infos = list(_counts(reader, (_INFO,)))

@@ -54,7 +54,10 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
         raise MissingInputError(f"{path}: the log is missing")
     said = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said), path.open("rb") as file:  # the library reports damage by printing
+        with (
+            contextlib.redirect_stdout(said),
+            path.open("rb") as file,
+        ):  # the library reports damage by printing
             log = ULog(file)
     except Exception as error:  # damaged bytes make the library raise nearly anything
         reason = " ".join(str(error).split())[:120] or type(error).__name__
@@ -69,7 +72,7 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
             f"{path}: the ULog breaks off before its first data: download it from the vehicle again"
         )
     notes: list[str] = []
-    if log.file_corruption or "corrupt" in said.getvalue().lower():
+    if log.file_corruption or "corrupt" in said.getvalue().lower() or _cut_short(path):
         notes.append("the file is damaged or cut short; what was whole in it was read")
 
     found = {name: len(sets[name]["timestamp"]) for name in _STREAMS if name in sets and _usable(name, sets)}
@@ -116,6 +119,15 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
         notes=tuple(notes),
         faults=tuple(faults),
     )
+
+
+def _cut_short(path: Path) -> bool:
+    # Message after message by their lengths: the last must end where the file does.
+    data = path.read_bytes()
+    at = 16
+    while at + 3 <= len(data):
+        at += 3 + data[at] + 256 * data[at + 1]
+    return at != len(data)
 
 
 def _s(microseconds: Any) -> FloatArray:
