@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,7 +70,7 @@ class KltTracker:
         self._anchored = 0
         self._next_id = 0
         self._clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)) if s.clahe else None
-        self._options = {
+        self._options: dict[str, Any] = {
             "winSize": (s.window_px, s.window_px),
             "maxLevel": s.levels,
             "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
@@ -86,7 +87,7 @@ class KltTracker:
         if self._clahe is not None:
             grey = self._clahe.apply(grey)
         self._now = grey
-        if not len(self.px):
+        if not len(self.px) or self._anchor is None:
             return np.empty(0, dtype=np.bool_)
         start = self.anchor_px.astype(np.float32)
         guess = (self.px if predicted_px is None else predicted_px).astype(np.float32)

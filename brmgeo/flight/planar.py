@@ -131,7 +131,7 @@ def run_planar(
     The yaw is 0 and x = y = 0 at the first frame; z is the height above ground.
     """
     s = settings or PlanarSettings()
-    sift = cv2.SIFT_create(nfeatures=s.features, contrastThreshold=0.02)
+    sift = cv2.SIFT.create(nfeatures=s.features, contrastThreshold=0.02)
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     rows: list[int] = []
     places: list[FloatArray] = []

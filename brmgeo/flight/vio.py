@@ -54,6 +54,7 @@ class VioSettings:
         min_tracks: with fewer points common with the keyframe a frame is blind.
         layer_m: points higher than this above the ground layer (and two sigma) are left out.
         max_gap_s: after a longer pause between frames nothing is tracked across.
+        lost_m: a blind stretch that leaves the place less sure than this begins a new segment.
     """
 
     gyro_noise: float = math.radians(0.01)
@@ -75,6 +76,7 @@ class VioSettings:
     min_tracks: int = 15
     layer_m: float = 2.0
     max_gap_s: float = 1.5
+    lost_m: float = 15.0
     klt: KltSettings = field(default_factory=KltSettings)
 
 
@@ -323,12 +325,11 @@ class VioFilter:
         self.omega = np.zeros(3)
         self.walk = 0.0
         self._walk_key = 0.0
-        self._segment = 0
-        self._since_layer = 0
+        self.segment = 0
+        self._sure_walk = 0.0
         self._layer: float | None = None
         self._interval = 0.1
         self._last_t = -math.inf
-        self._seen_again = False
         self._started = False
         self._anchor: tuple[FloatArray, FloatArray] | None = None
 
@@ -375,7 +376,13 @@ class VioFilter:
         rays = ray_from_pixel(self.camera, self.tracker.px)
         self._estimate_heights(rays)
         used = self._update(rays)
-        blind = used < s.min_tracks and len(self.points.sigma) + used >= 0 and bool(math.isfinite(gap))
+        blind = used < s.min_tracks and math.isfinite(gap)
+        if not blind:
+            # Beyond that, where the aircraft is after a blind stretch is a guess: the track begins anew.
+            sure = self.step_variance()
+            if sure - self._sure_walk > s.lost_m**2:
+                self.segment += 1
+            self._sure_walk = sure
         if self.tracker.wants_anchor or blind:
             self._drop_strays(rays)
             rays = ray_from_pixel(self.camera, self.tracker.px)
@@ -411,7 +418,6 @@ class VioFilter:
         if hasattr(self, "pk"):
             self._walk_key = self.step_variance()
         self.pk, self.rk = self.p.copy(), self.rot.copy()
-        self.vk = self.v.copy()
         select = np.zeros((SIZE, SIZE))
         select[:CP, :CP] = np.eye(CP)
         select[CP : CP + 3, P : P + 3] = np.eye(3)
@@ -503,7 +509,6 @@ class VioFilter:
         safe = np.where(enough, length2, 1.0)
         pts.height = np.where(enough, (excess * moved).sum(axis=1) / safe, 0.0)
         pts.sigma = np.where(enough, self.p[2] / self.focal / np.sqrt(safe), np.inf)
-        self._since_layer += 1
         sure = pts.sigma < 6.0
         if sure.sum() >= 20:
             layer = ground_layer(pts.height[sure], pts.sigma[sure])
@@ -522,7 +527,7 @@ class VioFilter:
         clear = np.maximum(self.settings.layer_m, 2.0 * np.minimum(pts.sigma, 1e6))
         return np.asarray((off > clear) | (off < -2.0 * clear))
 
-    def _weights(self, used: NDArray[np.bool_]) -> FloatArray:
+    def _weights(self, used: NDArray[np.int64]) -> FloatArray:
         s = self.settings
         # Heights that are not known yet count as those of ordinary houses.
         height_sigma = np.full(len(used), s.unevenness_m)
@@ -541,7 +546,7 @@ class VioFilter:
         ground = usable & ~self._high()
         if ground.sum() >= s.min_tracks:
             usable = ground
-        chosen = np.flatnonzero(usable)
+        chosen = np.flatnonzero(usable).astype(np.int64)
         if len(chosen) < s.min_tracks:
             return 0
         key, seen = np.ascontiguousarray(pts.key_ray[chosen]), np.ascontiguousarray(rays[chosen, :2])
@@ -646,16 +651,17 @@ def run_vio(
     xyz, wxyz, velocity = np.empty((n, 3)), np.empty((n, 4)), np.empty((n, 3))
     walk, yaw_sigma = np.empty(n), np.empty(n)
     tracks, blind = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
+    segment = np.zeros(n, dtype=np.int64)
     high = 0.0
     for i, grey in enumerate(images):
         tracks[i], blind[i] = vio.frame(float(times[i]), grey, float(agl_m[i]))
-        xyz[i], velocity[i] = vio.p, vio.v
+        xyz[i], velocity[i], segment[i] = vio.p, vio.v, vio.segment
         wxyz[i] = Rotation.from_matrix(vio.rot).as_quat()[[3, 0, 1, 2]]
         walk[i], yaw_sigma[i] = vio.step_variance(), math.sqrt(max(0.0, float(vio.cov[TH + 2, TH + 2])))
         high += float(vio._high().mean()) if len(vio.points.sigma) else 0.0
     sigma = np.sqrt(np.maximum(np.diag(vio.cov), 0.0))
     return VioResult(
-        Odometry(times, xyz, wxyz, "embedded visual-inertial odometry"),
+        Odometry(times, xyz, wxyz, "embedded visual-inertial odometry", segment),
         np.maximum.accumulate(walk),
         yaw_sigma,
         tracks,

@@ -1,0 +1,213 @@
+"""The visual-inertial filter against finite differences, and whole on a drawn plane that it knows through images only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from brmgeo.flight.camera import world_from_camera
+from brmgeo.flight.klt import KltTracker
+from brmgeo.flight.motion import motions, yaw_of
+from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu
+from brmgeo.flight.vio import SIZE, VioResult, _exp, _propagate, _tie, ground_layer, run_vio
+from brmgeo.synth.flight import Course, FlightSettings, fly, imu_of
+
+CAMERA = Camera.from_fov(320, 240, 43.0)
+MOUNT = Attitude(0.02, -0.15, 0.0)
+
+
+# ---------------------------------------------------------------- the filter's derivatives
+
+
+def _random_rotation(rng: np.random.Generator, size: float) -> FloatArray:
+    return np.asarray(_exp(rng.normal(0.0, size, 3)))
+
+
+def test_tie_jacobian_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(3)
+    rays = np.column_stack([rng.uniform(-0.4, 0.4, (6, 2)), np.ones(6)])
+    p, pk = np.array([20.0, 5.0, 151.0]), np.array([1.0, -2.0, 149.0])
+    nadir = MOUNT.body_from_camera()
+    rot, rotk = _random_rotation(rng, 0.1), _random_rotation(rng, 0.1)
+    vel, omega = rng.normal(0.0, 5.0, 3), rng.normal(0.0, 0.3, 3)
+    seen = rng.uniform(-0.4, 0.4, (6, 2))
+
+    def residual(dx: FloatArray) -> FloatArray:
+        # The true state is the nominal one with its errors put in; a delay moves pose and clone alike only here.
+        moved = p + dx[0:3] + vel * dx[15]
+        turned = _exp(dx[6:9] + rot @ omega * dx[15]) @ rot
+        mount = _exp(dx[16:19]) @ nadir
+        out = _tie(
+            moved, turned, pk + dx[19:22], _exp(dx[22:25]) @ rotk, mount, vel, omega, rays, seen,
+            np.zeros(6), np.zeros((SIZE, SIZE)), np.zeros(SIZE),
+        )  # fmt: skip
+        return np.asarray(out).ravel()
+
+    step = 1e-6
+    jac = np.stack(
+        [-(residual(step * e) - residual(-step * e)) / (2 * step) for e in np.eye(SIZE)], axis=1
+    )  # r = seen - predicted
+    matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+    r = np.asarray(
+        _tie(p, rot, pk, rotk, nadir, vel, omega, rays, seen, np.full(6, 2.5), matrix, vector)
+    ).ravel()
+    np.testing.assert_allclose(matrix, 2.5 * jac.T @ jac, atol=2e-5)
+    np.testing.assert_allclose(vector, 2.5 * jac.T @ r, atol=2e-6)
+
+
+def test_transition_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 0.5, 0.005)
+    gyro, accel = rng.normal(0.0, 0.3, (len(t), 3)), rng.normal(0.0, 1.0, (len(t), 3)) + [0.0, 0.0, 9.8]
+    state = (np.array([1.0, 2.0, 150.0]), np.array([5.0, -1.0, 0.2]), _random_rotation(rng, 0.2))
+    bias = (rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.05, 3))
+
+    def run(dx: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        p, v, rot = state
+        p1, v1, r1, phi, _, _ = _propagate(
+            p + dx[0:3], v + dx[3:6], _exp(dx[6:9]) @ rot, bias[0] + dx[9:12], bias[1] + dx[12:15],
+            0.1013, 0.3027, t, gyro, accel, 1e-6, 1e-4, 1e-8, 1e-8, 1e-2,
+        )  # fmt: skip
+        return p1, v1, r1, phi
+
+    p0, v0, r0, phi = run(np.zeros(15))
+    step = 1e-5
+    for k in range(15):
+        p1, v1, r1, _ = run(step * np.eye(15)[k])
+        turned = (r1 @ r0.T - np.eye(3)) / step
+        change = [(p1 - p0) / step, (v1 - v0) / step, [turned[2, 1], turned[0, 2], turned[1, 0]]]
+        np.testing.assert_allclose(np.concatenate(change), phi[:9, k], atol=6e-3)
+
+
+def test_free_fall_and_rest() -> None:
+    t = np.arange(0.0, 2.0, 0.01)
+    still, held = np.zeros((len(t), 3)), np.tile([0.0, 0.0, 9.80665], (len(t), 1))
+    zero = np.zeros(3)
+    noise = (1e-6,) * 5
+    p, v, _, _, q, _ = _propagate(zero, zero, np.eye(3), zero, zero, 0.0, 1.5, t, still, held, *noise)
+    np.testing.assert_allclose(np.r_[p, v], 0.0, atol=1e-9)
+    assert np.linalg.eigvalsh(q).min() > -1e-12
+    p, v, *_ = _propagate(zero, zero, np.eye(3), zero, zero, 0.0, 1.5, t, still, still, *noise)
+    np.testing.assert_allclose([p[2], v[2]], [-9.80665 * 1.5**2 / 2, -9.80665 * 1.5], rtol=1e-9)
+
+
+def test_ground_is_the_lowest_crowd() -> None:
+    rng = np.random.default_rng(1)
+    sigma = np.full(140, 0.8)
+    heights = np.r_[rng.normal(1.0, 0.8, 50), rng.normal(13.0, 0.8, 70), rng.uniform(-30.0, 60.0, 20)]
+    found = ground_layer(heights, sigma)
+    assert found is not None
+    assert abs(found - 1.0) < 1.0
+    assert ground_layer(heights[:5], sigma[:5]) is None
+
+
+# ---------------------------------------------------------------- a whole flight over a plane
+
+
+def _texture() -> NDArray[np.uint8]:
+    rng = np.random.default_rng(0)
+    out = np.zeros((900, 900), dtype=np.float32)
+    for sigma, weight in ((1.0, 1.0), (3.0, 3.0), (9.0, 8.0)):
+        out += weight * cv2.GaussianBlur(rng.standard_normal(out.shape).astype(np.float32), (0, 0), sigma)
+    return np.clip(128 + 90 * out / out.std() / 2.0, 0, 255).astype(np.uint8)
+
+
+def _draw(course: Course, rows: NDArray[np.int64], texture: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
+    # Pixel to texture by the plane's homography, built from four pixels and cv2's own solver.
+    gsd = 0.4
+    uv = np.array([[0.0, 0.0], [319.0, 0.0], [319.0, 239.0], [0.0, 239.0]])
+    for row in rows:
+        cam = world_from_camera(MOUNT, *course.roll_pitch_yaw[row])
+        rays = np.column_stack(
+            [(uv[:, 0] - CAMERA.cx) / CAMERA.fx, (uv[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(4)]
+        )
+        world = rays @ cam.T
+        at = course.xyz_m[row, :2] + world[:, :2] * (course.xyz_m[row, 2] / -world[:, 2:3])
+        pixel = np.column_stack([at[:, 0] / gsd + 450.0, 450.0 - at[:, 1] / gsd])
+        matrix = cv2.getPerspectiveTransform(pixel.astype(np.float32), uv.astype(np.float32))
+        yield np.asarray(
+            cv2.warpPerspective(texture, matrix, (320, 240), flags=cv2.INTER_LINEAR), dtype=np.uint8
+        )
+
+
+def _flown(**changes: object) -> tuple[Course, Imu]:
+    settings = replace(
+        FlightSettings(camera=CAMERA, mount=MOUNT, frame_interval_s=0.2, agl_m=100.0, turn_radius_m=15.0),
+        **changes,  # type: ignore[arg-type]
+    )
+    course = fly(np.array([[-60.0, -40.0], [40.0, -40.0], [40.0, 40.0]]), settings, 2)
+    return course, Imu(course.t_s, *imu_of(course, 2))
+
+
+def _estimate(
+    course: Course, imu: Imu, kept: NDArray[np.bool_] | None = None
+) -> tuple[VioResult, FloatArray]:
+    rows = course.frame_index if kept is None else course.frame_index[kept]
+    agl = course.xyz_m[rows, 2]
+    result = run_vio(course.t_s[rows], _draw(course, rows, _texture()), agl, imu, CAMERA, MOUNT)
+    turn = course.roll_pitch_yaw[rows[0], 2] - float(yaw_of(result.odometry.wxyz[0]))
+    c, s = math.cos(turn), math.sin(turn)
+    xy = result.odometry.xyz_m[:, :2] @ np.array([[c, s], [-s, c]]) + course.xyz_m[rows[0], :2]
+    return result, np.asarray(xy - course.xyz_m[rows, :2])
+
+
+def test_a_flight_over_a_plane_is_followed() -> None:
+    course, imu = _flown()
+    result, error = _estimate(course, imu)
+    assert np.hypot(*error.T).max() < 1.5  # of 170 m
+    yaw = yaw_of(result.odometry.wxyz) - course.roll_pitch_yaw[course.frame_index, 2]
+    assert np.abs(np.degrees(np.angle(np.exp(1j * (yaw - yaw[0]))))).max() < 1.0
+    assert not result.blind.any()
+    assert np.median(result.tracks) > 40
+    assert (np.diff(result.walk_m2) >= 0).all()
+    assert 0.0 < result.walk_m2[-1] < 4.0
+    steps = motions(replace(result.odometry, walk_m2=result.walk_m2), course.frame_times_s[::10])
+    assert all(0.02 <= m.sigma_m < 1.0 for m in steps[1:])
+
+
+def test_blind_stretch_is_bridged_and_marked() -> None:
+    course, imu = _flown()
+    t = course.frame_times_s
+    kept = (t < 14.0) | (t > 18.0)
+    result, error = _estimate(course, imu, kept)
+    first = int(np.flatnonzero(t[kept] > 18.0)[0])
+    assert result.blind[first]
+    assert result.blind.sum() < 4
+    assert np.hypot(*error.T).max() < 4.0
+    grown = np.diff(result.walk_m2)
+    assert grown[first - 1] > 10.0 * np.median(grown)
+
+
+def test_delay_is_found() -> None:
+    course, imu = _flown()
+    result, error = _estimate(course, replace(imu, t_s=imu.t_s + 0.05))
+    assert abs(result.delay_s - 0.05) < 0.012
+    assert result.delay_sigma_s < 0.01
+    assert np.hypot(*error.T).max() < 2.0
+
+
+def test_too_little_is_refused() -> None:
+    imu = Imu(np.arange(2.0), np.zeros((2, 3)), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="two of each"):
+        run_vio(np.array([0.0]), [], np.array([100.0]), imu, CAMERA, MOUNT)
+
+
+def test_tracker_follows_a_known_shift_and_drops_what_is_gone() -> None:
+    texture = _texture()
+    tracker = KltTracker()
+    first = texture[300:540, 300:620]
+    tracker.step(first)
+    assert tracker.refill() > 50
+    start, ids = tracker.px.copy(), tracker.ids.copy()
+    alive = tracker.step(texture[305:545, 307:627])
+    assert alive.mean() > 0.8
+    np.testing.assert_allclose(np.median(tracker.px - start[alive], axis=0), [-7.0, -5.0], atol=0.05)
+    np.testing.assert_array_equal(tracker.ids, ids[alive])
+    gone = tracker.step(np.full((240, 320), 90, dtype=np.uint8))
+    assert gone.mean() < 0.2
