@@ -360,7 +360,9 @@ def _write(
             raise FlightError(
                 f"{path}: the log tells no height: give --agl (metres above ground) or --ground"
             )
-        attitude = log.attitude if log.attitude is not None else log.odometry
+        # An autopilot's and a gimbal's attitude come first; an IMU's own is of the IMU's axes, so odometry is better.
+        own = log.attitude is not None and (log.attitude.north or log.odometry is None)
+        attitude = log.attitude if own else log.odometry
         if attitude is not None:
             known = _bridged(attitude.t_s, times, MAX_BRIDGE_S)
             if known[good].mean() < 1.0:

@@ -61,6 +61,7 @@ def bag(
     image_clock_s: float = 0.0,
     imu_scale: tuple[float, float] = (1.0, 1.0),
     imu_late_s: float = 0.0,
+    imu_turns: bool | None = None,
     stamps: np.ndarray | None = None,
     twice: bool = False,
     encoding: str = "bgr8",
@@ -141,8 +142,8 @@ def bag(
                 imu = make(
                     "sensor_msgs/msg/Imu",
                     header=header(stamp + imu_late_s, "imu"),
-                    orientation=quaternion(np.array([1.0, 0, 0, 0])),
-                    orientation_covariance=c9,
+                    orientation=quaternion(np.array([1.0, 0, 0, 0]) if imu_turns is None else WXYZ[i]),
+                    orientation_covariance=c9 if imu_turns is not False else np.r_[-1.0, c9[1:]],
                     angular_velocity=vector("Vector3", GYRO[i] * imu_scale[0]),
                     angular_velocity_covariance=c9,
                     linear_acceleration=vector("Vector3", ACCEL[i] * imu_scale[1]),

@@ -122,6 +122,11 @@ def test_optics_from_the_best_tag(tmp_path: Path) -> None:
     camera = read_log(shots(calibrated, 1, xmp=dji((0.0, -90.0, 0.0), more=more))).camera
     assert camera is not None
     assert camera.fx == 66.6
+    # The same photo made half as large keeps its tags, which tell the size that they are of.
+    more += ' drone-dji:CalibratedOpticalCenterX="80.0"'
+    camera = read_log(shots(calibrated, 1, xmp=dji((0.0, -90.0, 0.0), more=more))).camera
+    assert camera is not None
+    assert camera.fx == 33.3
 
 
 def test_a_wide_photo_is_a_cut_of_the_whole_sensor(tmp_path: Path) -> None:

@@ -102,6 +102,15 @@ def test_pictures_in_other_encodings(tmp_path: Path, encoding: str) -> None:
             assert np.abs(decoded.astype(int) - picture(i)).mean() < 6
 
 
+def test_an_imus_orientation_counts_only_where_it_is_told(tmp_path: Path) -> None:
+    log = read_log(bag(tmp_path / "told", "mcap", topics=("imu",), imu_turns=True))
+    assert log.attitude is not None
+    assert turn_between(log.attitude.wxyz, WXYZ) < 1e-6
+    assert not log.attitude.north
+    assert read_log(bag(tmp_path / "untold", "mcap", topics=("imu",), imu_turns=False)).attitude is None
+    assert read_log(bag(tmp_path / "empty", "mcap", topics=("imu",))).attitude is None
+
+
 def test_a_bag_with_several_odometries_lists_them(tmp_path: Path) -> None:
     path = bag(tmp_path / "flight", "mcap", topics=("odom", "pose"), twice=True)
     with pytest.raises(

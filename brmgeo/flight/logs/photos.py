@@ -303,26 +303,30 @@ def _optics(photo: _Photo, detail: dict[int, Any], tags: dict[str, str]) -> None
     def plain(focal: float, source: str) -> None:
         photo.camera, photo.camera_from = Camera(width, height, focal, focal, *centre), source
 
+    # Calibrations in pixels are of the original: a photo made smaller since keeps their numbers.
+    middle = _number(tags.get("drone-dji:CalibratedOpticalCenterX"))
+    original = 2.0 * middle if middle > 0.0 else _number(detail.get(40962))
+    smaller = width / original if original > 0.0 and max(width, height) == width else 1.0
     # DJI's own calibration: "date;fx,fy,cx,cy,k1,k2,p1,p2,k3", the centre as an offset.
     dewarp = [_number(v) for v in tags.get("drone-dji:DewarpData", "").partition(";")[2].split(",")]
     if len(dewarp) == 9 and all(math.isfinite(v) for v in dewarp) and dewarp[0] > 0.0:
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = dewarp
-        camera = Camera(
-            width, height, fx, fy, width / 2 + cx - 0.5, height / 2 + cy - 0.5, (k1, k2, p1, p2, k3)
-        )
+        fx, fy, cx, cy = (v * smaller for v in dewarp[:4])
+        k1, k2, p1, p2, k3 = dewarp[4:]
+        cx, cy = width / 2 + cx - 0.5, height / 2 + cy - 0.5
+        camera = Camera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
         photo.camera, photo.camera_from = camera, "XMP DewarpData"
         return
     calibrated = _number(tags.get("drone-dji:CalibratedFocalLength"))
     if calibrated > 0.0:
-        return plain(calibrated, "XMP CalibratedFocalLength")
+        return plain(calibrated * smaller, "XMP CalibratedFocalLength")
     focal_mm = _number(detail.get(37386))
     unit_mm = {2: 25.4, 3: 10.0, 4: 1.0}.get(detail.get(41488, 2), 25.4)
     density = _number(detail.get(41486))
     perspective = _number(tags.get("Camera:PerspectiveFocalLength"))
     if perspective > 0.0 and density > 0.0:
-        return plain(perspective * density / unit_mm, "XMP PerspectiveFocalLength")
+        return plain(perspective * density / unit_mm * smaller, "XMP PerspectiveFocalLength")
     if focal_mm > 0.0 and density > 0.0:
-        focal = focal_mm * density / unit_mm
+        focal = focal_mm * density / unit_mm * smaller
         if 0.3 * width < focal < 20.0 * width:  # several makers write the density of the print here
             return plain(focal, "EXIF focal length and sensor density")
     equivalent = _number(detail.get(41989))

@@ -238,10 +238,10 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
                 streams[name].add(message.header.stamp, recorded, [len(streams[name].rows)])
             elif name == imu_topic:
                 g, a = message.angular_velocity, message.linear_acceleration
-                q = message.orientation
-                streams[name].add(
-                    message.header.stamp, recorded, [g.x, g.y, g.z, a.x, a.y, a.z, q.w, q.x, q.y, q.z]
-                )
+                # By the message's definition, -1 says that no orientation is told.
+                q, told = message.orientation, float(message.orientation_covariance[0] != -1.0)
+                turn = [told * q.w, told * q.x, told * q.y, told * q.z]
+                streams[name].add(message.header.stamp, recorded, [g.x, g.y, g.z, a.x, a.y, a.z, *turn])
             elif name == fix_topic and message.status.status >= 0:
                 known = message.position_covariance_type > 0
                 sigma = float(np.sqrt(max(message.position_covariance[0], 0.0))) if known else np.nan
