@@ -434,13 +434,13 @@ class Belief:
         return math.log(total)
 
     def search(
-        self, llr_of: Callable[[int], F32 | None], low: float, high: float, weight: float = 1.0
+        self, llr_of: F32 | Callable[[int], F32 | None], low: float, high: float, weight: float = 1.0
     ) -> float:
         """Weigh the whole grid, unlisted ground included, and list what stands out; returns the log of the evidence.
 
         Args:
             llr_of: gives the (rows, cols) float32 log-likelihood ratios of one heading bin, which are overwritten, or
-                None to rule the heading out.
+                None to rule the heading out; or one such array that holds for all headings.
             low, high: bounds of the ratios.
             weight: factor of the ratios, for views that repeat what was seen.
         """
@@ -452,12 +452,17 @@ class Belief:
         count = 0
         mass_all = 0.0
         masses = np.zeros(self.grid, np.float64)
+        shared = _factor(llr_of, low, high, weight) if isinstance(llr_of, np.ndarray) else None
         for h in range(self.headings):
-            llr = llr_of(h)
-            if llr is None:
-                continue
+            if isinstance(llr_of, np.ndarray):
+                assert shared is not None
+                factor = shared
+            else:
+                llr = llr_of(h)
+                if llr is None:
+                    continue
+                factor = _factor(llr, low, high, weight)
             even = np.float32(self.rest / self.cells)
-            factor = _factor(llr, low, high, weight)
             _search_heading(factor, self.index[h], self.blocks, even, masses)
             mass_all += float(masses.sum())
             cells = np.argwhere(masses > threshold)

@@ -86,8 +86,8 @@ class GridMatcher(ABC):
     @abstractmethod
     def _score_all(
         self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
-    ) -> Callable[[int], F32 | None]:
-        """A function of the heading bin that gives ratios of all cells; asked for in order of bins."""
+    ) -> F32 | Callable[[int], F32 | None]:
+        """Ratios of all cells if no heading changes them, else a function of the heading bin, asked in order of bins."""
 
     @abstractmethod
     def _score_listed(self, view: View, yaw_rad: float) -> F32:
@@ -181,7 +181,7 @@ class GridMatcher(ABC):
         ):
             wanted = np.ones(self.belief.headings, np.bool_)
             score = self._score_all(view, yaw if yaw is not None else 0.0, wanted)
-            if yaw is None and motion.step_m is not None:
+            if yaw is None and motion.step_m is not None and not isinstance(score, np.ndarray):
                 score = self._any_heading(score)
             gain = self.belief.search(score, low, high, weight)
         elif yaw is None and motion.step_m is not None:

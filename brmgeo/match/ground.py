@@ -1,17 +1,17 @@
-"""The ground that a matcher looks at: the building map, its coverage per cell, its ratio maps at any radius."""
+"""The ground that a matcher looks at: the building map, its coverage per cell, its ratios in discs of any radius."""
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
 
-import cv2
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError
-from brmgeo.maps.ratio import disc_counts
+from brmgeo.match.belief import BLOCK
+from brmgeo.match.threads import split
 
 UNKNOWN = 255
 
@@ -88,67 +88,152 @@ def disc_pixels(radius_px: float) -> int:
     return int((dx[:, None] ** 2 + dx[None, :] ** 2 <= radius_px**2).sum())
 
 
-class RatioCache:
-    """Building and known ground in discs about every cell, per step of radius.
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _disc_sums(prefix, shape, at, weight, first, blocks, shift, out, n0, n1):  # type: ignore[no-untyped-def]
+    """Sums over discs about the cells of blocks, from sums along rows.
 
-    Radii are rounded to a geometric ladder of ``step`` (0.04: 4 %), so a frame's radius is off by at most 2 %. A ratio
-    then changes by about 2 * 2 % of the difference between the disc's rim and its mean, some 1e-3 on real ground,
-    against a noise of the features of 2e-2 and more. The least recently used radii are dropped beyond ``keep``.
+    prefix holds, flat, (f, rows, cols) = shape: the sum of a row's sub-cells before edge f * col + phase. Row t of
+    disc k lies first[k] + t sub-cells below the top of its cell; at[k, t] is where in prefix the right and left
+    ends and the edges after them lie, from there; weight[k, t] are the weights of these four sums. A row without
+    weight ends disc k. Positions are unsigned: signed ones would be tested for counting from the end, and the
+    loop would not be vectorised.
+    """
+    factor, cols = shape[0], shape[2]
+    for n in range(n0, n1):
+        left = blocks[n, 1] * BLOCK + shift
+        for k in range(at.shape[0]):
+            for i in range(BLOCK):
+                top = (blocks[n, 0] * BLOCK + i + shift) * factor + first[k]
+                acc = np.zeros(BLOCK, np.float32)
+                for t in range(at.shape[1]):
+                    a, b = weight[k, t, 0], weight[k, t, 1]
+                    if a == 0.0 and b == 0.0:
+                        break
+                    c, d = weight[k, t, 2], weight[k, t, 3]
+                    base = (top + t) * cols + left
+                    p, q = np.uint64(base + at[k, t, 0]), np.uint64(base + at[k, t, 1])
+                    r, s = np.uint64(base + at[k, t, 2]), np.uint64(base + at[k, t, 3])
+                    for j in range(BLOCK):
+                        u = np.uint64(j)
+                        acc[u] += (
+                            a * prefix[p + u] + b * prefix[q + u] - c * prefix[r + u] - d * prefix[s + u]
+                        )
+                for j in range(BLOCK):
+                    out[k, n, i, j] = acc[j]
+
+
+def _chords(radius: float, factor: int) -> tuple[int, NDArray[np.int64], NDArray[np.float32]]:
+    """First row, ends (rows, 4, 2) and weights (rows, 4) of ``_disc_sums`` for a disc of ``radius`` sub-cells."""
+    middle = factor / 2.0
+    first, last = math.floor(middle - radius), math.ceil(middle + radius)
+    edge = np.clip(np.arange(first, last + 1) - middle, -radius, radius)
+    # Mean half chord of each row: the disc keeps its area exactly.
+    area = 0.5 * (edge * np.sqrt(radius**2 - edge**2) + radius**2 * np.arcsin(edge / radius))
+    half = np.diff(area)
+    at = np.empty((len(half), 4, 2), np.int64)
+    weight = np.empty((len(half), 4), np.float32)
+    for end, x in ((0, middle + half), (2, middle - half)):
+        whole = np.floor(x).astype(np.int64)
+        for more in (0, 1):
+            at[:, end + more, 0] = (whole + more) % factor
+            at[:, end + more, 1] = (whole + more) // factor
+        weight[:, end], weight[:, end + 1] = 1.0 - (x - whole), x - whole
+    return first, at, weight
+
+
+class DiscAreas:
+    """Building and known ground in discs of any radii about the centres of cells, block by block of 16 x 16 cells.
+
+    Sub-cells of the map (half a cell where a cell has an even number of pixels) are summed along rows once; a disc is
+    then four sums a row, whatever stands on the map. The rim cuts sub-cells by area, as if their buildings were spread
+    evenly: against counting pixels that is off by less than a hundredth of a ring's ratio, below the features' noise
+    (``tests/match``). No radius is rounded and nothing is kept per radius, so a large map costs 4 bytes a
+    sub-cell, and heights may change from frame to frame.
 
     Args:
         ground: the map.
-        step: relative size of a step, > 0.
-        cell_px: areas are kept at the centres of cells of this many pixels.
-        keep: number of radii kept.
+        cell_px: pixels of a cell's side.
     """
 
-    def __init__(self, ground: GroundMap, step: float, cell_px: int, keep: int = 48) -> None:
-        self._ground = ground
-        self._step = math.log1p(step)
-        self._cell = cell_px
-        self._keep = keep
-        self._kept: OrderedDict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = OrderedDict()
-        building = ground.building
-        self._built_mask = building == 1
-        self._known = ground.coverage(cell_px)[1]
+    def __init__(self, ground: GroundMap, cell_px: int) -> None:
+        h, w = ground.building.shape
+        self._cell_m = cell_px * ground.gsd_m
+        self._cells = (-(-h // cell_px), -(-w // cell_px))
+        factor = next((f for f in range(2, cell_px + 1) if cell_px % f == 0), 1)
+        if self._cells[0] * self._cells[1] * factor**2 > 300_000_000:
+            factor = 1
+        self._factor = factor
+        built, known = ground.coverage(cell_px // factor)
+        if factor > 1:
+            known = ground.coverage(cell_px)[1]
+        self._covers = ((built, factor), (known, 1))
+        self._margin = -1
+        self._prefix: list[NDArray[np.float32]] = []
+        self._whole = np.empty((0, 0), np.bool_)
 
-    def radius(self, radius_m: float) -> float:
-        """The ladder's radius nearest to ``radius_m``, metres."""
-        return math.exp(round(math.log(radius_m) / self._step) * self._step)
+    def at_blocks(
+        self, blocks: NDArray[np.int32], radii_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Square metres of building and of known ground in each disc: two (radii, n, 16, 16) float32.
 
-    def at_cells(self, radius_m: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(built, known) square metres within the ladder's radius of each cell's centre, two (ny, nx) float32."""
-        step = round(math.log(radius_m) / self._step)
-        if step in self._kept:
-            self._kept.move_to_end(step)
-            return self._kept[step]
-        radius_px = math.exp(step * self._step) / self._ground.gsd_m
-        area = np.float32(self._ground.gsd_m**2)
-        built = self._sampled(disc_counts(self._built_mask, radius_px, threads=2)) * area
-        # Known ground only divides: its share over the cells in reach is near enough, and exact where all is known.
-        reach = math.ceil(radius_px / self._cell)
-        offset = np.arange(-reach, reach + 1) * self._cell
-        distance = np.hypot(offset[:, None], offset[None, :])
-        disc = np.clip((radius_px - distance) / self._cell + 0.5, 0.0, 1.0).astype(np.float32)
-        known = cv2.filter2D(self._known, cv2.CV_32F, disc / disc.sum(), borderType=cv2.BORDER_CONSTANT)
-        pair = (built, np.maximum(known * np.float32(math.pi * radius_px**2) * area, built))
-        self._kept[step] = pair
-        while len(self._kept) > self._keep:
-            self._kept.popitem(last=False)
-        return pair
+        ``blocks`` is (n, 2): row and column of blocks. Ground beyond the map's edge is unknown.
+        """
+        margin = math.ceil(float(radii_m.max()) / self._cell_m) + 2
+        if margin > self._margin:
+            self._margin = margin
+            self._prefix = [_row_sums(cover, f, self._cells, margin) for cover, f in self._covers]
+            self._whole = self._all_known()
+        built = self._sums(0, blocks, radii_m)
+        known = np.empty_like(built)
+        whole = self._whole[blocks[:, 0], blocks[:, 1]]
+        known[:, whole] = (math.pi * radii_m**2)[:, None, None, None]
+        known[:, ~whole] = self._sums(1, blocks[~whole], radii_m)
+        return built, np.maximum(known, built, out=known)
 
-    def _sampled(self, counts: NDArray[np.unsignedinteger]) -> NDArray[np.float32]:
-        """Counts at cell centres: of the middle pixel, or the mean of the four about a centre on a pixel corner."""
-        c = self._cell
-        if c == 1:
-            return counts.astype(np.float32)
-        h, w = counts.shape
-        rows, cols = np.arange(-(-h // c)) * c + c // 2, np.arange(-(-w // c)) * c + c // 2
-        rows, cols = np.minimum(rows, h - 1), np.minimum(cols, w - 1)
-        if c % 2:
-            return counts[np.ix_(rows, cols)].astype(np.float32)
-        r0, c0 = np.maximum(rows - 1, 0), np.maximum(cols - 1, 0)
-        total = counts[np.ix_(rows, cols)].astype(np.float32)
-        for rr, cc in ((r0, cols), (rows, c0), (r0, c0)):
-            total += counts[np.ix_(rr, cc)]
-        return total / np.float32(4)
+    def _all_known(self) -> NDArray[np.bool_]:
+        """(block rows, block cols): whether all ground in reach of a block is known."""
+        sums = self._prefix[1][0]
+        side = BLOCK + 2 * self._margin
+        across = sums[:, side::BLOCK] - sums[:, :-side:BLOCK]
+        down = np.cumsum(across, axis=0, dtype=np.float64)
+        down = np.concatenate([np.zeros((1, down.shape[1])), down])
+        return np.asarray(down[side::BLOCK] - down[:-side:BLOCK] > side * side - 0.01)
+
+    def _sums(
+        self, which: int, blocks: NDArray[np.int32], radii_m: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """(radii, n, 16, 16) square metres of one cover in discs."""
+        prefix, factor = self._prefix[which], self._covers[which][1]
+        sub_m = self._cell_m / factor
+        discs = [_chords(float(r) / sub_m, factor) for r in radii_m]
+        rows = max(len(weight) for _, _, weight in discs)
+        at = np.zeros((len(discs), rows + 1, 4), np.int64)
+        weight = np.zeros((len(discs), rows + 1, 4), np.float32)
+        for k, (_, ends, weights) in enumerate(discs):
+            at[k, : len(ends)] = ends[:, :, 0] * prefix[0].size + ends[:, :, 1]
+            weight[k, : len(ends)] = weights
+        first = np.array([top for top, _, _ in discs])
+        sums = np.empty((len(discs), len(blocks), BLOCK, BLOCK), np.float32)
+        flat, margin = prefix.reshape(-1), self._margin
+        split(
+            lambda n0, n1: _disc_sums(flat, prefix.shape, at, weight, first, blocks, margin, sums, n0, n1),
+            len(blocks),
+            32,
+        )
+        sums *= np.float32(sub_m**2)
+        return sums
+
+
+def _row_sums(
+    cover: NDArray[np.float32], factor: int, cells: tuple[int, int], margin: int
+) -> NDArray[np.float32]:
+    """(factor, rows, cols) sums along rows before each edge, with ``margin`` cells around, whole blocks inside."""
+    rows, cols = (-(-n // BLOCK) * BLOCK + 2 * margin for n in cells)
+    out = np.zeros((factor, rows * factor, cols + 1), np.float32)
+    line = np.zeros((cols + 1) * factor + 1, np.float64)
+    for i, row in enumerate(cover):
+        line[1 + margin * factor : 1 + margin * factor + len(row)] = row
+        total = np.cumsum(line)
+        for phase in range(factor):
+            out[phase, margin * factor + i] = total[phase : phase + (cols + 1) * factor : factor]
+    return out

@@ -401,66 +401,74 @@ def view_rings(view: View, count: int) -> Rings:
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, out, i0, i1):  # type: ignore[no-untyped-def]
-    """log p(rings | cell): (rows, cols) from (n, rows, cols) square metres of building and known in the map's rings."""
+    """log p(rings | cell): (rows, cols) from (n, rows, cols) square metres of building and known ground in discs."""
     n, _rows, cols = built.shape
     # lgamma terms make densities of different widths comparable with the even spread of the background.
     const = math.lgamma((dof + 1) / 2) - math.lgamma(dof / 2) - 0.5 * math.log(dof * math.pi)
     for i in range(i0, i1):
         for j in range(cols):
-            total = 0.0
+            used = 0
+            # Products instead of sums of logarithms: at most 32 factors between 1e-7 and 1e6 stay in range.
+            spread = 1.0
+            apart = 1.0
             for k in range(n):
                 if area[k] <= 0:
                     continue
-                if known[k, i, j] < 0.5 * area[k]:
+                b, m = built[k, i, j], known[k, i, j]
+                if k:
+                    b -= built[k - 1, i, j]
+                    m -= known[k - 1, i, j]
+                if m < 0.5 * area[k]:
                     # Ground that the map does not know: as good as the background's even spread.
                     continue
-                g = built[k, i, j] / known[k, i, j]
+                g = b / m
                 p = alarm + (hit - alarm) * g
                 var = (g * hit * (1 - hit) + (1 - g) * alarm * (1 - alarm)) * unit / area[k]
                 var += floor * floor + move[k]
                 d = share[k] - p
-                total += const - 0.5 * math.log(var) - 0.5 * (dof + 1) * math.log1p(d * d / (dof * var))
-            out[i, j] = total
+                spread *= var
+                apart *= 1.0 + d * d / (dof * var)
+                used += 1
+            out[i, j] = used * const - 0.5 * math.log(spread) - 0.5 * (dof + 1) * math.log(apart)
 
 
 def ring_loglik(
-    rings: Rings, built: list[F32], known: list[F32], rates: Rates, settings: RatioSettings, cell: bool
+    rings: Rings, built: F32, known: F32, rates: Rates, settings: RatioSettings, move: F64 | None = None
 ) -> F32:
-    """log p(rings | place), (rows, cols) float32, for maps of the ground in the discs of the rings' radii.
+    """log p(rings | place), (...) float32, for maps of the ground in the discs of the rings' radii.
 
     Args:
         rings: of the view.
-        built, known: square metres of building and of known ground in each disc, (rows, cols) float32 each.
+        built, known: (n, ..., cols) float32 square metres of building and of known ground in each disc.
         rates: P1, P0 and the independent area.
         settings: floor and degrees of freedom.
-        cell: whether a place stands for its whole cell; the features' change within it then adds to their noise.
+        move: (n,) variance of each ring's ratio within what a place stands for (``cell_variance``), or None for points.
     """
-    built_ring = np.diff(np.stack(built), axis=0, prepend=np.float32(0))
-    known_ring = np.diff(np.stack(known), axis=0, prepend=np.float32(0))
-    move = np.zeros(len(built_ring))
-    if cell:
-        share = np.divide(built_ring, known_ring, out=np.zeros_like(built_ring), where=known_ring > 0)
-        # A place is spread evenly over its cell: a twelfth of the variance between neighbouring cells, per axis.
-        for axis in (1, 2):
-            move += (np.diff(share, axis=axis) ** 2).mean(axis=(1, 2), dtype=np.float64) / 12.0
-    out = np.empty(built_ring.shape[1:], np.float32)
+    n, cols = len(built), built.shape[-1]
+    flat_built, flat_known = built.reshape(n, -1, cols), known.reshape(n, -1, cols)
+    more = np.zeros(n) if move is None else move
+    out = np.empty(flat_built.shape[1:], np.float32)
     split(
         lambda i0, i1: _ring_loglik(
-            built_ring, known_ring, rings.share, rings.area_m2,
-            rates.hit, rates.false_alarm, rates.independent_m2, settings.noise, move, settings.dof, out, i0, i1,
+            flat_built, flat_known, rings.share, rings.area_m2,
+            rates.hit, rates.false_alarm, rates.independent_m2, settings.noise, more, settings.dof, out, i0, i1,
         ),
         len(out),
         64,
     )  # fmt: skip
-    return out
+    return out.reshape(built.shape[1:])
 
 
-def ring_llr(rings: Rings, built: list[F32], known: list[F32], rates: Rates, settings: RatioSettings) -> F32:
-    """(rows, cols) float32 log-likelihood ratio of a view's rings at every cell of a grid; see ``ring_loglik``."""
-    out = ring_loglik(rings, built, known, rates, settings, cell=True)
-    top = float(out.max())
-    own = top + math.log(float(np.exp(out - top, dtype=np.float64).mean()))
-    # Half the background is the map's own distribution, half an even spread of each ring's share over [0, 1]
-    # (density 1): where nothing on the map resembles the view, being off the map must win.
-    background = np.logaddexp(own, 0.0) - math.log(2.0)
-    return np.asarray(out - np.float32(background), np.float32)
+def cell_variance(built: F32, known: F32) -> F64:
+    """(n,) variance of each ring's ratio within a cell, from (n, ..., rows, cols) areas in discs about cells' centres.
+
+    A place is spread evenly over its cell: a twelfth of the variance between neighbouring cells, per axis.
+    """
+    ring_built = np.diff(built, axis=0, prepend=np.float32(0))
+    ring_known = np.diff(known, axis=0, prepend=np.float32(0))
+    share = np.divide(ring_built, ring_known, out=np.zeros_like(ring_built), where=ring_known > 0)
+    axes = tuple(range(1, share.ndim))
+    total = np.zeros(len(built))
+    for axis in (-2, -1):
+        total += (np.diff(share, axis=axis) ** 2).mean(axis=axes, dtype=np.float64) / 12.0
+    return total

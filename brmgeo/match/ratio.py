@@ -12,8 +12,8 @@ from brmgeo.flight.values import View
 from brmgeo.maps.ratio import disc_counts
 from brmgeo.match.belief import BLOCK
 from brmgeo.match.grid import GridMatcher
-from brmgeo.match.ground import UNKNOWN, GroundMap, RatioCache, disc_pixels
-from brmgeo.match.likelihood import Rates, ring_llr, ring_loglik, view_rings
+from brmgeo.match.ground import UNKNOWN, DiscAreas, GroundMap, disc_pixels
+from brmgeo.match.likelihood import Rates, Rings, cell_variance, ring_loglik, view_rings
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor
 
@@ -24,12 +24,21 @@ F64 = NDArray[np.float64]
 class RatioMatcher(GridMatcher):
     """Belief over place and heading, weighed by ring ratios; heading comes from the motion alone."""
 
+    SAMPLE = 96
+    CHUNK = 4096
+
     def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
         super().__init__(ground, settings)
-        self._cache = RatioCache(ground, settings.ratio.radius_step, self.cell_px)
+        self._areas = DiscAreas(ground, self.cell_px)
         r = settings.rates
         self._rates = Rates(r.hit, r.false_alarm, settings.ratio.independent_m2)
-        self._llr = np.zeros(self.belief.shape, np.float32)
+        n, m = self.belief.grid
+        self._every = np.stack(np.divmod(np.arange(n * m), m), axis=1).astype(np.int32)
+        # Blocks that stand for the whole map where only few places are scored: the same ones in every frame.
+        some = np.random.default_rng(0).permutation(len(self._every))[: self.SAMPLE]
+        self._sample = self._every[np.sort(some)]
+        self._rings: Rings | None = None
+        self._move = (0, np.empty(0))
 
     def _bounds(self) -> tuple[float, float]:
         return self.settings.rates.llr_min, self.settings.rates.llr_max
@@ -41,24 +50,70 @@ class RatioMatcher(GridMatcher):
         return math.pi * view.radius_m**2, self.settings.ratio.repeat
 
     def _look(self, view: View) -> None:
-        rings = view_rings(view, self.settings.ratio.radii)
-        maps = [self._cache.at_cells(float(r)) for r in rings.radius_m]
-        self._llr = ring_llr(
-            rings, [m[0] for m in maps], [m[1] for m in maps], self._rates, self.settings.ratio
-        )
+        self._rings = view_rings(view, self.settings.ratio.radii)
+
+    def _at_blocks(self, blocks: NDArray[np.int32]) -> F32:
+        """(n, 16, 16) log-likelihoods at blocks (row, col); cells beyond the map count for nothing."""
+        assert self._rings is not None
+        s = self.settings.ratio
+        step = round(math.log(float(self._rings.radius_m[-1])) / 0.02)
+        if self._move[0] != step:
+            # The features' change within a cell is a property of the map and hardly moves with the radius.
+            variance = cell_variance(*self._areas.at_blocks(self._sample, self._rings.radius_m))
+            self._move = (step, variance)
+        move = self._move[1]
+        out = np.empty((len(blocks), BLOCK, BLOCK), np.float32)
+        for n in range(0, len(blocks), self.CHUNK):
+            part = slice(n, n + self.CHUNK)
+            built, known = self._areas.at_blocks(blocks[part], self._rings.radius_m)
+            out[part] = ring_loglik(self._rings, built, known, self._rates, s, move)
+        return out
+
+    def _background(self, inside: float) -> float:
+        """Half the map's own distribution, half an even spread of each ring's share over [0, 1] (density 1).
+
+        Where nothing on the map resembles the view, being off the map must win. ``inside`` is the log of the mean
+        likelihood over the map.
+        """
+        return float(np.logaddexp(inside, 0.0)) - math.log(2.0)
+
+    def _mean(self, loglik: F32, blocks: NDArray[np.int32]) -> tuple[float, int]:
+        """Log of the summed likelihood over the cells of blocks that lie on the map, and how many these are."""
+        rows, cols = self.belief.shape
+        row = blocks[:, 0, None] * BLOCK + np.arange(BLOCK) < rows
+        col = blocks[:, 1, None] * BLOCK + np.arange(BLOCK) < cols
+        on_map = row[:, :, None] & col[:, None, :]
+        if not on_map.any():
+            return -math.inf, 0
+        values = loglik[on_map]
+        top = float(values.max())
+        return top + math.log(float(np.exp(values - top).sum(dtype=np.float64))), len(values)
 
     def _score_all(
         self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
-    ) -> Callable[[int], F32 | None]:
-        return lambda h: self._llr.copy()
+    ) -> F32 | Callable[[int], F32 | None]:
+        loglik = self._at_blocks(self._every)
+        total, count = self._mean(loglik, self._every)
+        rows, cols = self.belief.shape
+        n, m = self.belief.grid
+        field = loglik.reshape(n, m, BLOCK, BLOCK).transpose(0, 2, 1, 3).reshape(n * BLOCK, m * BLOCK)
+        background = self._background(total - math.log(count))
+        return np.asarray(field[:rows, :cols] - np.float32(background), np.float32)
 
     def _score_listed(self, view: View, yaw_rad: float) -> F32:
-        rows, cols = self.belief.shape
-        padded = np.zeros((self.belief.grid[0] * BLOCK, self.belief.grid[1] * BLOCK), np.float32)
-        padded[:rows, :cols] = self._llr
-        n, m = self.belief.grid
-        tiles = padded.reshape(n, BLOCK, m, BLOCK).transpose(0, 2, 1, 3)
-        return np.ascontiguousarray(tiles[self.belief.keys[:, 1], self.belief.keys[:, 2]])
+        code = self.belief.keys[:, 1] * np.int32(self.belief.grid[1]) + self.belief.keys[:, 2]
+        unique, inverse = np.unique(code, return_inverse=True)
+        blocks = self._every[unique]
+        rest = self._sample[~np.isin(self._sample[:, 0] * self.belief.grid[1] + self._sample[:, 1], unique)]
+        loglik = self._at_blocks(np.concatenate([blocks, rest]))
+        # The map's mean likelihood: listed blocks for themselves, the others by the sample.
+        own, count = self._mean(loglik[: len(blocks)], blocks)
+        other, sampled = self._mean(loglik[len(blocks) :], rest)
+        cells = self.belief.shape[0] * self.belief.shape[1]
+        if sampled:
+            own = float(np.logaddexp(own, other + math.log(max(cells - count, 1) / sampled)))
+        background = self._background(own - math.log(cells))
+        return np.ascontiguousarray((loglik - np.float32(background))[: len(blocks)][inverse.ravel()])
 
     def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
         """The rings' likelihood about the pose on a grid of 1 m, as one Gaussian; the heading stays unknown.
@@ -102,9 +157,9 @@ class RatioMatcher(GridMatcher):
                     disc_counts(cut != UNKNOWN, float(radius) / g.gsd_m)[inner, inner].astype(np.float32)
                     * area
                 )
-        loglik = ring_loglik(rings, built, known, self._rates, self.settings.ratio, cell=False).astype(
-            np.float64
-        )
+        loglik = ring_loglik(
+            rings, np.stack(built), np.stack(known), self._rates, self.settings.ratio
+        ).astype(np.float64)
         offset = np.arange(-half, half + 1, stride)
         x = g.left + (col + offset + 0.5) * g.gsd_m - pose[0]
         y = g.top - (row + offset + 0.5) * g.gsd_m - pose[1]

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from match_scene import town, view_at
@@ -14,10 +15,26 @@ from scipy.ndimage import gaussian_filter, shift
 
 from brmgeo.errors import InputError, SettingsError
 from brmgeo.flight.values import Motion
-from brmgeo.match import BeliefSettings, GroundMap, OdometrySettings, RateSettings, make_matcher
+from brmgeo.match import (
+    BeliefSettings,
+    GroundMap,
+    OdometrySettings,
+    RateSettings,
+    RatioSettings,
+    make_matcher,
+)
 from brmgeo.match.belief import BLOCK, Belief
-from brmgeo.match.ground import RatioCache, disc_pixels
-from brmgeo.match.likelihood import MapCover, RateLearner, Rates, mask_templates, view_points, view_rings
+from brmgeo.match.ground import DiscAreas, disc_pixels
+from brmgeo.match.likelihood import (
+    MapCover,
+    RateLearner,
+    Rates,
+    Rings,
+    mask_templates,
+    ring_loglik,
+    view_points,
+    view_rings,
+)
 from brmgeo.match.paper import RingReach, _follow_pairs, ring_spans, search
 from brmgeo.match.register import Registrar
 from brmgeo.match.smooth import Anchor, _solve_tridiagonal, smooth_path
@@ -213,28 +230,63 @@ def test_rings_equal_brute_force() -> None:
         assert rings.share[k] == pytest.approx(built / n)
 
 
-def test_ratio_cache_equals_counting_and_its_step_is_harmless() -> None:
-    ground = town(3, 400.0, 120).ground(0.5)
-    cache = RatioCache(ground, 0.02, 10)
-    radius = cache.radius(47.0)
-    assert radius == pytest.approx(47.0, rel=0.0101)
-    built, known = cache.at_cells(47.0)
-    i, j = 21, 55
-    y, x = np.mgrid[0:800, 0:800] + 0.5
-    four = [
-        ((x - cx) ** 2 + (y - cy) ** 2 <= (radius / 0.5) ** 2)[ground.building == 1].sum()
-        for cx in (j * 10 + 4.5, j * 10 + 5.5)
-        for cy in (i * 10 + 4.5, i * 10 + 5.5)
-    ]
-    assert built[i, j] == pytest.approx(np.mean(four) * 0.25)
-    assert known[i, j] == pytest.approx(math.pi * radius**2, rel=1e-4)
-    half = ((x - 5.0) ** 2 + (y - 405.0) ** 2 <= (radius / 0.5) ** 2).sum() * 0.25
-    assert known[40, 0] == pytest.approx(half, rel=0.03)
-    # One step of radius, twice the largest rounding, changes ratios by far less than their noise.
-    other_built, other_known = cache.at_cells(47.0 * 1.02)
-    change = built / known - other_built / other_known
-    assert np.sqrt(np.mean(change**2)) < 0.006
-    assert disc_pixels(7.3) == sum(a * a + b * b <= 7.3**2 for a in range(-8, 9) for b in range(-8, 9))
+@pytest.mark.parametrize("cell_px", [10, 9, 7, 1])
+def test_disc_areas_equal_counting(cell_px: int) -> None:
+    ground = town(3, 400.0, 120).ground(1.0 if cell_px < 9 else 0.5)
+    ground.building[100:140, 100:150] = 255
+    g, (h, w) = ground.gsd_m, ground.building.shape
+    blocks = np.array([[0, 0], [1, 1], [1, 0]], np.int32)
+    radii = np.array([7.4, 30.0, 47.0])
+    areas = DiscAreas(ground, cell_px)
+    areas.at_blocks(blocks, radii[:1])
+    built, known = areas.at_blocks(blocks, radii)
+    y, x = np.mgrid[0:h, 0:w] + 0.5
+    noise = []
+    for n, i, j in itertools.product(range(3), (0, 7, 15), (1, 8)):
+        row, col = (blocks[n] * BLOCK + (i, j) + 0.5) * cell_px
+        if row > h or col > w:
+            continue
+        inside = [(x - col) ** 2 + (y - row) ** 2 <= (r / g) ** 2 for r in radii]
+        for k, disc in enumerate(inside):
+            # A rim cuts sub-cells (and of known ground, which only divides, cells) by area, not pixel by pixel.
+            assert built[k, n, i, j] == pytest.approx(
+                (ground.building[disc] == 1).sum() * g * g, abs=radii[k]
+            )
+            assert known[k, n, i, j] == pytest.approx(
+                max((ground.building[disc] != 255).sum() * g * g, built[k, n, i, j]), rel=0.07, abs=radii[k]
+            )
+        ring = inside[2] & ~inside[1]
+        if (ground.building[ring] != 255).sum() > 3000:
+            exact = (ground.building[ring] == 1).sum() / (ground.building[ring] != 255).sum()
+            got = (built[2, n, i, j] - built[1, n, i, j]) / (known[2, n, i, j] - known[1, n, i, j])
+            noise.append(got - exact)
+    # Below the noise that no rate explains.
+    assert not noise or np.sqrt(np.mean(np.square(noise))) < 0.006
+    whole = DiscAreas(GroundMap(np.ones((640, 640), np.uint8), 0.0, 0.0, 0.5), 10)
+    built, known = whole.at_blocks(np.array([[1, 1]], np.int32), radii[:2])
+    for k in (0, 1):
+        np.testing.assert_allclose(built[k], math.pi * radii[k] ** 2, rtol=1e-5)
+        np.testing.assert_allclose(known[k], math.pi * radii[k] ** 2, rtol=1e-5)
+
+
+def test_ring_density_is_the_student_density() -> None:
+    rings = Rings(np.array([0.3, 0.1, 0.6]), np.array([400.0, 1200.0, 0.0]), np.array([10.0, 20.0, 30.0]))
+    built = np.array([[[100.0, 0.0]], [[300.0, 100.0]], [[300.0, 900.0]]], np.float32)
+    known = np.array([[[400.0, 400.0]], [[1600.0, 700.0]], [[2800.0, 2800.0]]], np.float32)
+    settings = RatioSettings()
+    move = np.array([1e-4, 2e-4, 3e-4])
+    got = ring_loglik(rings, built, known, RATES, settings, move)
+    for j, used in ((0, (0, 1)), (1, (0,))):
+        expected = 0.0
+        for k in used:
+            g = (built[k, 0, j] - (built[k - 1, 0, j] if k else 0)) / (
+                known[k, 0, j] - (known[k - 1, 0, j] if k else 0)
+            )
+            mean = RATES.false_alarm + (RATES.hit - RATES.false_alarm) * g
+            var = g * RATES.hit * (1 - RATES.hit) + (1 - g) * RATES.false_alarm * (1 - RATES.false_alarm)
+            var = var * RATES.independent_m2 / rings.area_m2[k] + settings.noise**2 + move[k]
+            expected += scipy.stats.t.logpdf(rings.share[k], settings.dof, mean, math.sqrt(var))
+        assert got[0, j] == pytest.approx(expected, abs=1e-4)
 
 
 def test_rates_follow_what_is_seen() -> None:
