@@ -523,14 +523,22 @@ def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, writ
     from pipelines import logs as job
 
     if write is not None:
-        write.write_text(job.inspect_document([p for p in paths if p.name != "SOURCE.txt"]), encoding="utf-8")
+        write.write_text(job.inspect_document(paths), encoding="utf-8")
         click.echo(f"wrote {write}")
         return
+    options = LogOptions(topic, frame_times_s=job.times_of(times) if times else None)
+    unread = 0
     for path in paths:
-        for line in job.inspect(
-            path, LogOptions(topic, frame_times_s=job.times_of(times) if times else None)
-        ):
-            click.echo(line)
+        try:
+            for line in job.inspect(path, options):
+                click.echo(line)
+        except BrmgeoError as error:
+            if len(paths) == 1:
+                raise
+            click.echo(f"{path.name}: {error}")
+            unread += 1
+    if unread:
+        raise SettingsError(f"inspect: {unread} of {len(paths)} paths could not be read, as told above")
 
 
 @cli.command()

@@ -27,7 +27,6 @@ from brmgeo.geo.crs import LONLAT
 MAX_BRIDGE_S = 1.0
 #: Clocks of two streams that differ by more are not of one flight recorder.
 MAX_STAMP_SPREAD_S = 0.5
-MAX_LAG_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -742,14 +741,18 @@ def inspect_document(paths: Sequence[Path]) -> str:
         "option that mends it. A log without pictures takes them from `--photos` (by its camera triggers) or `--video`.",
         "",
     ]
+    others = []
     for path in paths:
         try:
             lines = inspect(path)
         except InputError as error:
-            lines = [f"{path.name}: {str(error).replace(str(path), path.name)}"]
+            others.append(f"- {str(error).replace(str(path), path.name)}")
+            continue
         out += [f"## {path.name}", "", "```", *lines, "```", ""]
     same = pairs(paths)
     if same:
         out += ["## Tracks of the same minutes", "", "After the best rotation, shift and scale:", ""]
         out += [f"- {line}" for line in same] + [""]
+    if others:
+        out += ["## Not read", "", *others, ""]
     return "\n".join(out)

@@ -354,12 +354,13 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True) -> Path
     us = era == "TimeUS"
     clock = "Q" if us else "I"
     name = "XKF1" if us else "EKF1"
+    old = "Status,TimeMS,Lat,Lng,Alt,T"
     formats: dict[str, tuple[int, str, str]] = {
         "ATT": (130, clock + "fff", f"{era},Roll,Pitch,Yaw"),
         "IMU": (131, clock + "ffffff", f"{era},GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
         "RFND": (133, clock + "f", f"{era},Dist"),
         "CAM": (134, clock + "H", f"{era},Img"),
-        "GPS": (135, "QBLLf", "TimeUS,Status,Lat,Lng,Alt") if us else (135, "BILLfI", "Status,TimeMS,Lat,Lng,Alt,T"),
+        "GPS": (135, *(("QBIHLLf", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt") if us else ("BILLfI", old))),
     }  # fmt: skip
     if position:
         formats[name] = (
@@ -404,11 +405,27 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True) -> Path
             row("RFND", t, float(XYZ[i, 2]))
         if i % 4 == 0:
             place = round(LAT[i] * 1e7), round(LON[i] * 1e7), float(XYZ[i, 2])
-            row("GPS", *((t, 3, *place) if us else (3, 12345, *place, t)))
+            row("GPS", *((t, 3, t // 1000, 2300, *place) if us else (3, 12345, *place, t)))
         if i % 60 == 0:
             row("CAM", t, i // 60)
     path.write_bytes(b"".join(out))
     return path
+
+
+def as_text(path: Path) -> Path:
+    """The .log that a ground station makes of a .bin."""
+    from pymavlink import DFReader
+
+    log = DFReader.DFReader_binary(str(path))
+    lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
+    kinds = [f for f in log.formats.values() if f.name != "FMT"]
+    lines += [f"FMT, {f.type}, {f.len}, {f.name}, {f.format}, {','.join(f.columns)}" for f in kinds]
+    while (m := log.recv_match()) is not None:
+        if m.get_type() != "FMT":
+            lines.append(", ".join([m.get_type(), *(repr(getattr(m, c)) for c in m.get_fieldnames())]))
+    log.close()
+    path.with_suffix(".log").write_text("\n".join(lines) + "\n")
+    return path.with_suffix(".log")
 
 
 def telemetry(path: Path) -> Path:

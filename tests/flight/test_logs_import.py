@@ -242,6 +242,11 @@ def test_inspect_tells_what_is_in_a_log(tmp_path: Path) -> None:
     good(tmp_path / "flight", tmp_path / "log")
     said = "\n".join(inspect(tmp_path / "flight"))
     assert "flight folder 'log'" in said
+    (tmp_path / "words.txt").write_text("no log\n")
+    status, said = run("inspect", tmp_path / "words.txt", tmp_path / "log.ulg")
+    assert status == 2
+    assert "vehicle_local_position" in said
+    assert "1 of 2 paths could not be read" in said
     document = tmp_path / "logs.md"
     assert run("inspect", tmp_path / "log.ulg", tmp_path / "flight", "--write", document)[0] == 0
     assert document.read_text().count("\n## ") == 2

@@ -15,6 +15,7 @@ from log_writers import (
     WXYZ,
     XYZ,
     T,
+    as_text,
     bag,
     dataflash,
     picture,
@@ -213,6 +214,17 @@ def test_ardupilot_logs_of_both_eras_tell_the_flight(tmp_path: Path, era: str) -
     assert log.triggers_s is not None
     assert np.allclose(log.triggers_s, T[::60])
     assert log.uses_gnss
+
+
+def test_a_dataflash_log_as_text_is_the_same_log(tmp_path: Path) -> None:
+    binary = dataflash(tmp_path / "log.bin")
+    first, second = read_log(binary), read_log(as_text(binary))
+    assert first.odometry is not None
+    assert second.odometry is not None
+    assert np.array_equal(first.odometry.t_s, second.odometry.t_s)
+    assert np.abs(first.odometry.xyz_m - second.odometry.xyz_m).max() < 1e-5
+    assert second.gnss is not None
+    check_imu(second)
 
 
 def test_a_dataflash_log_without_position_and_one_cut_short(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ pytest.importorskip("pymavlink")
 NAMES = sorted(p.name for p in LOGS.iterdir() if p.name != "SOURCE.txt") if LOGS.is_dir() else []
 
 
+@cache
 def look(name: str, topic: str | None = None) -> Log:
     return read_log(LOGS / name, LogOptions(topic, any_topic=True))
 
