@@ -569,9 +569,10 @@ class VioFilter:
             matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
             arguments = (self.p, self.rot, self.pk, self.rk, self.camera_mount, self.v, self.omega, key, seen)
             miss = _tie(*arguments, np.zeros(len(chosen)), matrix, vector)
-            off = miss - (np.nanmedian(miss, axis=0) if turn == 0 else 0.0)
+            miss = np.where(np.isfinite(miss), miss, 1e3)  # a ray that does not meet the ground
+            off = miss - (np.median(miss, axis=0) if turn == 0 else 0.0)
             size = np.hypot(off[:, 0], off[:, 1]) * self.focal
-            scale = max(0.5, 1.5 * float(np.nanmedian(size)))
+            scale = max(0.5, 1.5 * float(np.median(size)))
             # Cauchy weights; what is far off is left out.
             weight = np.where(size < 5.0 * scale, base / (1.0 + (size / scale) ** 2), 0.0)
             inliers = int((weight > 0).sum())
