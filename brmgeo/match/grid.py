@@ -70,6 +70,7 @@ class GridMatcher(ABC):
         self.belief = Belief((-(-h // self.cell_px), -(-w // self.cell_px)), settings.belief)
         self.track: Track | None = None
         self._misses = 0
+        self._off_frames = 0
         self._confirmed = False
         self._unfixed_searches = 0
         self._since_informed_m = 0.0
@@ -104,6 +105,14 @@ class GridMatcher(ABC):
     @abstractmethod
     def _evidence(self, view: View) -> tuple[float, float]:
         """Ground that the evidence comes from, square metres, and its weight per share of new ground."""
+
+    def _systematic(self) -> float:
+        """What all views of a flight get wrong together beside their levelling, metres per axis."""
+        return 0.0
+
+    def _lasting_m(self, view: View) -> float:
+        """Error per axis that stays the same from frame to frame, metres: levelling, and what the method adds."""
+        return math.hypot(self.settings.odometry.attitude_sigma_rad * view.agl_m, self._systematic())
 
     def _least_fit(self) -> float:
         """How well a measured pose must fit before there is a first fix; 0 when none is needed."""
@@ -243,6 +252,7 @@ class GridMatcher(ABC):
     def _estimate(self, view: View, motion: Motion, mode: Mode | None) -> Estimate:
         s = self.settings.belief
         belief = self.belief
+        self._off_frames = self._off_frames + 1 if belief.off > s.lost_mass else 0
         cells, mass, count = belief.heaviest(s.candidates)
         extra = {
             "entropy": belief.entropy(),
@@ -255,7 +265,7 @@ class GridMatcher(ABC):
             g = self.ground.gsd_m
             middle = np.array([self.ground.left + w * g / 2, self.ground.top - h * g / 2])
             spread = np.diag([(w * g) ** 2, (h * g) ** 2]) / 12.0
-            status: Status = "lost" if belief.off > s.lost_mass else "ambiguous"
+            status: Status = "lost" if self._off_frames >= s.lost_frames else "ambiguous"
             return Estimate(
                 view.t_s,
                 status,
@@ -281,14 +291,14 @@ class GridMatcher(ABC):
             self.track, self._confirmed = None, False
         if self.track is not None:
             extra["scale"] = math.exp(float(self.track.mean[3]))
-        # The part of the levelling error that lasts the whole flight is averaged away by no filter.
-        cov = cov + np.eye(2) * (self.settings.odometry.attitude_sigma_rad * view.agl_m) ** 2
+        # What lasts the whole flight is averaged away by no filter.
+        cov = cov + np.eye(2) * self._lasting_m(view) ** 2
         sigma = math.sqrt(float(np.trace(cov)) / 2.0)
         if sure and sigma <= s.converged_sigma_m and (self._confirmed or self._least_fit() <= 0):
             status = "converged"
             self._unfixed_searches = 0
         else:
-            status = "lost" if belief.off > s.lost_mass else "ambiguous"
+            status = "lost" if self._off_frames >= s.lost_frames else "ambiguous"
         if motion.yaw_rad is not None:
             yaw = wrap(heading + motion.yaw_rad)
         elif motion.step_m is None:
@@ -371,8 +381,8 @@ class GridMatcher(ABC):
         path = smooth_path(
             [v.t_s for v in self._views], self._motions, self._anchors, self.settings.odometry, register
         )
-        tilt = np.array([self.settings.odometry.attitude_sigma_rad * v.agl_m for v in self._views])
-        return SmoothedPath(path.t_s, path.xy, path.yaw_rad, np.hypot(path.sigma_m, tilt))
+        lasting = np.array([self._lasting_m(v) for v in self._views])
+        return SmoothedPath(path.t_s, path.xy, path.yaw_rad, np.hypot(path.sigma_m, lasting))
 
 
 def _packed(view: View) -> View:

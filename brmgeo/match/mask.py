@@ -33,6 +33,9 @@ class MaskMatcher(GridMatcher):
     def _bounds(self) -> tuple[float, float]:
         return self.settings.rates.llr_min, self.settings.rates.llr_max
 
+    def _systematic(self) -> float:
+        return self.settings.rates.systematic_sigma_m
+
     def _least_fit(self) -> float:
         return self.settings.rates.least_fit
 

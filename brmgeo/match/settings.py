@@ -76,6 +76,10 @@ class RateSettings:
         repeat: weight of a view's evidence per share of new ground in it, [0.1, 100]: views overlap, and what
             two of them show counts little more than once, else a hovering aircraft would grow sure of a place
             that only looks alike. 1 would hold if masks of the same ground always had the same errors.
+        systematic_sigma_m: standard deviation per axis of what all views of a flight get wrong together, metres, [0, 100]:
+            roofs lean away from the camera by height over AGL times their distance, and where buildings stand on one
+            side of it a view is pulled to that side for many frames. No filter averages that away: it is added to
+            what is reported, not to what is measured.
         least_fit: the first fix needs a registered view in which building and map overlap this well (Dice: twice
             the common area over the sum of both), [0, 1].
         learn: whether P1 falls and P0 rises when registered frames fit worse than these say; they never get
@@ -92,6 +96,7 @@ class RateSettings:
     llr_min: float = -8.0
     llr_max: float = 25.0
     repeat: float = 3.0
+    systematic_sigma_m: float = 0.5
     least_fit: float = 0.6
     learn: bool = True
 
@@ -104,6 +109,7 @@ class RateSettings:
             llr_min=(-50, 0),
             llr_max=(1, 100),
             repeat=(0.1, 100),
+            systematic_sigma_m=(0, 100),
             least_fit=(0, 1),
         )
         if self.false_alarm >= self.hit:
@@ -127,7 +133,9 @@ class BeliefSettings:
         mode_radius_m: cells this close to the heaviest one belong to its mode, metres, [5, 500].
         converged_mass: belief that one mode must hold, (0.5, 1).
         converged_sigma_m: largest spread (root of half the trace) of a fix, metres, [0.1, 200].
-        lost_mass: off-map belief above which the status is ``lost``, (0, 1).
+        lost_mass, lost_frames: the status is ``lost`` once off the map has held more than this belief, (0, 1), for so
+            many frames in a row, [1, 1000]: one view that looks like nothing on the map is no evidence yet, and a
+            start without any is ``ambiguous``.
         candidates: how many of the heaviest cells an estimate lists, [1, 1_000_000].
     """
 
@@ -142,7 +150,8 @@ class BeliefSettings:
     mode_radius_m: float = 40.0
     converged_mass: float = 0.99
     converged_sigma_m: float = 15.0
-    lost_mass: float = 0.5
+    lost_mass: float = 0.8
+    lost_frames: int = 5
     candidates: int = 2000
 
     def __post_init__(self) -> None:
@@ -160,6 +169,7 @@ class BeliefSettings:
             converged_mass=(0.5, 1),
             converged_sigma_m=(0.1, 200),
             lost_mass=(0, 1),
+            lost_frames=(1, 1000),
             candidates=(1, 1_000_000),
         )
 

@@ -269,6 +269,32 @@ def test_malformed_frames_are_refused(method: str) -> None:
             matcher.step(view, motion)
 
 
+def test_a_start_without_evidence_is_ambiguous_not_lost() -> None:
+    # Some views without a building on a map full of them: little evidence, and none for a place.
+    for method in ("mask", "ratio"):
+        matcher = make_matcher(method, GROUND, QUICK)
+        for i in range(3):
+            motion = Motion(5.0 * bool(i), np.array([25.0, 0.0]) if i else None, 0.0, 0.1)
+            estimate = matcher.step(blank_view(5.0 * i), motion)
+            assert estimate.status == "ambiguous"
+
+
+def test_the_systematic_error_is_reported_and_does_not_move_the_fix(plain) -> None:  # type: ignore[no-untyped-def]
+    f, estimates, matcher = plain
+    settings = replace(QUICK, rates=replace(QUICK.rates, systematic_sigma_m=0.0))
+    without = make_matcher("mask", GROUND, settings)
+    for a, b in zip(estimates, run(without, f)):
+        assert a.status == b.status
+        np.testing.assert_allclose(a.mean, b.mean)
+        if a.mass > 0:
+            extra = QUICK.rates.systematic_sigma_m**2
+            np.testing.assert_allclose(a.covariance - b.covariance, np.eye(2) * extra, atol=1e-9)
+    smooth, bare = matcher.smooth(), without.smooth()
+    np.testing.assert_allclose(
+        smooth.sigma_m, np.hypot(bare.sigma_m, QUICK.rates.systematic_sigma_m), rtol=1e-9
+    )
+
+
 def test_a_single_frame_and_none_at_all() -> None:
     for method in ("mask", "ratio", "paper"):
         matcher = make_matcher(method, GROUND, QUICK)
