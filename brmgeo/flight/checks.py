@@ -100,7 +100,7 @@ def imu_units(
         when, rate = turn_rate(t_s, wxyz)
         start, end = max(when[0], imu.t_s[0]), min(when[-1], imu.t_s[-1])
         if end - start > 1.0:
-            at = np.arange(start, end, 0.05)
+            at = np.arange(start, min(end, start + 3600.0), 0.05)
             width = max(0.1, 2.0 * float(np.median(np.diff(t_s))))
             ours, theirs = _resampled(imu.t_s, speed, at, width), _resampled(when, rate, at, width)
             turning = theirs > max(0.05, float(np.quantile(theirs, 0.5)))

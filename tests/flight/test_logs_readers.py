@@ -18,6 +18,7 @@ from log_writers import (
     as_text,
     bag,
     dataflash,
+    photo,
     picture,
     px4,
     telemetry,
@@ -250,6 +251,31 @@ def test_telemetry_tells_the_flight_of_the_vehicle_that_speaks_most(tmp_path: Pa
     assert "MAVLink system 1" in log.notes[0]
     assert log.height is not None
     assert np.abs(log.height.agl_m - XYZ[::4, 2]).max() < 0.011
+
+
+@pytest.mark.parametrize("make", ["ulg", "bin", "tlog", "bag", "jpg"])
+def test_damaged_bytes_are_read_past_or_refused_in_one_line(tmp_path: Path, make: str) -> None:
+    files = {
+        "ulg": lambda: px4(tmp_path / "a.ulg", version="new"),
+        "bin": lambda: dataflash(tmp_path / "a.bin"),
+        "tlog": lambda: telemetry(tmp_path / "a.tlog"),
+        "bag": lambda: bag(tmp_path / "a", "ros1", topics=("odom",)),
+        "jpg": lambda: photo(tmp_path / "photos" / "a.jpg"),
+    }
+    (tmp_path / "photos").mkdir()
+    path = files[make]()
+    whole = np.frombuffer(path.read_bytes(), np.uint8)
+    rng = np.random.default_rng(11)
+    for count in (1, 10, 200) * 2:
+        broken = whole.copy()
+        broken[rng.integers(0, len(whole), count)] = rng.integers(0, 256, count)
+        path.write_bytes(broken.tobytes())
+        said = ""
+        try:
+            read_log(path.parent if make == "jpg" else path)
+        except InputError as error:
+            said = str(error)
+        assert "\n" not in said
 
 
 def test_kinds_are_told_by_content(tmp_path: Path) -> None:

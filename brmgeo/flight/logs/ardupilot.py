@@ -57,13 +57,17 @@ _TELEMETRY = (
 _G = 9.80665
 
 
-def _rows(messages: list[Any], get: Callable[[Any], list[float]]) -> FloatArray:
-    # (n, k) rows whose first column, the time, grows; messages that lack a field are of another version.
+def _rows(messages: list[Any], get: Callable[[Any], list[float]], needed: int | None = None) -> FloatArray:
+    # (n, k) rows whose first column, the time, grows and whose first ``needed`` are numbers; a message that lacks a
+    # field is of another version, or damaged, and left out.
     out: list[list[float]] = []
     last = -np.inf
     for message in messages:
-        row = get(message)
-        if row[0] > last and all(np.isfinite(v) for v in row[:4]):
+        try:
+            row = get(message)
+        except AttributeError:
+            continue
+        if row[0] > last and all(np.isfinite(v) for v in row[:needed]):
             out.append(row)
             last = row[0]
     return np.array(out, dtype=np.float64) if out else np.empty((0, 0))
@@ -162,7 +166,9 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
         )
     elif stream is not None:
         rows = _rows(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw])
-        begun = np.flatnonzero(rows[:, 1:4].any(axis=1))  # the filter says zero until it has an origin
+        begun = (
+            np.flatnonzero(rows[:, 1:4].any(axis=1)) if rows.size else np.empty(0, np.int64)
+        )  # the filter says zero until it has an origin
         if begun.size:
             rows = rows[begun[0] :]
             wxyz = _from_degrees(rows[:, 4:7])
@@ -177,7 +183,8 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
     inertial = [m for m in found.get("IMU", []) if getattr(m, "I", 0) == 0]
     if inertial:
         rows = _rows(inertial, lambda m: [time(m), m.GyrX, m.GyrY, m.GyrZ, m.AccX, m.AccY, m.AccZ])
-        imu = Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]), flu_from_frd(rows[:, 4:7]))
+        if rows.size:
+            imu = Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]), flu_from_frd(rows[:, 4:7]))
     gnss = _gnss(found, time)
     if odometry is not None and stream != "VISP":
         notes.append(
@@ -233,7 +240,7 @@ def _from_degrees(angles: FloatArray) -> FloatArray:
 
 
 def _gnss(found: dict[str, list[Any]], time: Callable[[Any], float]) -> Gnss | None:
-    fixes = [m for m in found.get("GPS", []) if m.Status >= 3 and getattr(m, "I", 0) == 0]
+    fixes = [m for m in found.get("GPS", []) if getattr(m, "Status", 0) >= 3 and getattr(m, "I", 0) == 0]
     rows = _rows(fixes, lambda m: [time(m), m.Lng, m.Lat, m.Alt])
     if not rows.size:
         return None
@@ -349,6 +356,7 @@ def _telemetry(path: Path, options: LogOptions) -> Log:
             m.alt * 1e-3,
             (getattr(m, "h_acc", 0) or np.nan) * 1e-3,
         ],
+        4,
     )
     if rows.size:
         gnss = Gnss(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -165,13 +166,15 @@ def read_photos(path: Path, options: LogOptions | None = None) -> Log:
 
 def _photo(path: Path) -> _Photo:
     try:
-        with Image.open(path) as image:
-            size = image.size
-            exif = image.getexif()
-            main = dict(exif)
-            detail = dict(exif.get_ifd(ExifTags.IFD.Exif))
-            gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
-            xmp = image.info.get("xmp") or main.get(700) or b""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of damaged tags, which then count as not there
+            with Image.open(path) as image:
+                size = image.size
+                exif = image.getexif()
+                main = dict(exif)
+                detail = dict(exif.get_ifd(ExifTags.IFD.Exif))
+                gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
+                xmp = image.info.get("xmp") or main.get(700) or b""
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         raise FlightError(f"{path}: no readable photo: copy it again or leave it out") from None
     photo = _Photo(path, size)

@@ -75,6 +75,15 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
     if log.file_corruption or "corrupt" in said.getvalue().lower() or _cut_short(path):
         notes.append("the file is damaged or cut short; what was whole in it was read")
 
+    try:
+        return _normal(path, log, sets, notes, options)
+    except (KeyError, IndexError) as error:
+        raise FlightError(
+            f"{path}: a message lacks its field {error}: the log is damaged, or of a PX4 version that is not known here"
+        ) from None
+
+
+def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], options: LogOptions) -> Log:
     found = {name: len(sets[name]["timestamp"]) for name in _STREAMS if name in sets and _usable(name, sets)}
     # Several are the rule, and they are one estimator's words: the first in order of worth is the choice.
     stream = choose(path, "odometry", "--topic", options.topic, found, any_topic=True)
@@ -211,6 +220,10 @@ def _odometry(
     segment = _segments(t, data, keep, ("reset_counter",), resets)
     turn = enu_flu_from_ned_frd if ned.all() else flu_flu_from_frd_frd
     xyz = enu_from_ned(xyz) if ned.all() else flu_from_frd(xyz)
+    if not keep.all():
+        notes.append(
+            f"{name}: {int((~keep).sum())} of {len(keep)} rows are not valid or not in order, and left out"
+        )
     notes.append(f"{name}: pose frame {'NED' if ned.all() else 'FRD (arbitrary heading)'}")
     return Odometry(t, xyz, turn(unit(f"{path}: {name}", q)), name, segment), resets
 
