@@ -43,7 +43,11 @@ class GroundMap:
             raise InputError(
                 f"a map needs a finite place and GSD > 0: left {self.left}, top {self.top}, GSD {self.gsd_m} m"
             )
-        counts = np.bincount(b.ravel(), minlength=256)
+        # In bands: bincount works on a copy eight times as large.
+        band = max(1, 4_000_000 // b.shape[1])
+        counts = np.zeros(256, np.int64)
+        for i in range(0, b.shape[0], band):
+            counts += np.bincount(b[i : i + band].ravel(), minlength=256)
         if counts[2:UNKNOWN].any():
             raise InputError(
                 "a building map holds 0, 1 and 255 (unknown) only: "
