@@ -11,10 +11,10 @@ STAMP  := $(VENV)/.installed
 BRMGEO := $(BIN)/brmgeo
 export SCHEDULER
 
-.PHONY: help setup maps status localize evaluate demo test test-fast test-slow qgis-test bench lint check clean
+.PHONY: help setup maps status localize evaluate demo test test-fast test-slow qgis-test bench bench-odometry lint check clean
 
 help:  ## List these commands
-	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-10s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-14s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(STAMP)  ## Create .venv and install brmgeo with its tools
 
@@ -55,6 +55,9 @@ bench: setup  ## Measure the kernels against their alternatives and rewrite the 
 	$(BIN)/python benchmarks/ratio_maps.py
 	$(BIN)/python benchmarks/dxf_readers.py --write docs/benchmarks-dxf.md
 	$(BIN)/python benchmarks/matchers.py
+
+bench-odometry: maps  ## Measure embedded odometry over seeds and conditions (hours) and rewrite docs/odometry.md
+	$(BIN)/python benchmarks/odometry.py --seeds 5 --write
 
 lint: setup  ## ruff and mypy
 	$(BIN)/ruff check .

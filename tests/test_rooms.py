@@ -24,6 +24,9 @@ KERNELS = {
     "brmgeo.flight.view",
     "brmgeo.flight.motion",
     "brmgeo.flight.checks",
+    "brmgeo.flight.vio",
+    "brmgeo.flight.klt",
+    "brmgeo.flight.planar",
 }
 ADAPTERS = {
     "brmgeo.ingest",
