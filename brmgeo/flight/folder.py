@@ -607,7 +607,9 @@ def _covariance(path: Path, odometry: Odometry) -> Odometry:
     walk = table.numbers["walk_m2"]
     falling = np.flatnonzero(np.diff(walk, prepend=0.0) < 0.0)
     if falling.size:
-        raise refuse(path, table.lines[int(falling[0])], "walk_m2", "the gathered variance falls: it can only grow")
+        raise refuse(
+            path, table.lines[int(falling[0])], "walk_m2", "the gathered variance falls: it can only grow"
+        )
     segment = table.numbers.get("segment")
     return replace(
         odometry, walk_m2=walk, segment=odometry.segment if segment is None else segment.astype(np.int64)
