@@ -131,8 +131,8 @@ def _chords(radius: float, factor: int) -> tuple[int, NDArray[np.int64], NDArray
     middle = factor / 2.0
     first, last = math.floor(middle - radius), math.ceil(middle + radius)
     edge = np.clip(np.arange(first, last + 1) - middle, -radius, radius)
-    # Mean half chord of each row: the disc keeps its area exactly.
-    area = 0.5 * (edge * np.sqrt(radius**2 - edge**2) + radius**2 * np.arcsin(edge / radius))
+    # Mean half chord of each row: the disc keeps its area exactly. As a product the root's argument is never negative.
+    area = 0.5 * (edge * np.sqrt((radius - edge) * (radius + edge)) + radius**2 * np.arcsin(edge / radius))
     half = np.diff(area)
     at = np.empty((len(half), 4, 2), np.int64)
     weight = np.empty((len(half), 4), np.float32)

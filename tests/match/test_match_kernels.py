@@ -24,7 +24,7 @@ from brmgeo.match import (
     make_matcher,
 )
 from brmgeo.match.belief import BLOCK, Belief
-from brmgeo.match.ground import DiscAreas, disc_pixels
+from brmgeo.match.ground import DiscAreas, _chords, disc_pixels
 from brmgeo.match.likelihood import (
     MapCover,
     RateLearner,
@@ -535,3 +535,18 @@ def test_values_refuse_nonsense() -> None:
         RateSettings(hit=0.1, false_alarm=0.5)
     with pytest.raises(SettingsError, match="paper, ratio, mask"):
         make_matcher("magic", GroundMap(np.ones((10, 10), np.uint8), 0, 0, 1.0))
+
+
+def test_chords_of_any_radius_are_finite_and_keep_the_area():
+    # For the first ones r ** 2 (pow) is a bit less than r * r, which once made a root of a negative number.
+    odd = [57.33697737834437, 31.09665930593685, 29.363052226938056, 1.5854919348047054, 38.64392663542872]
+    for radius in [*odd, *np.random.default_rng(5).uniform(0.3, 60.0, 500)]:
+        _first, at, weight = _chords(float(radius), 5)
+        assert np.isfinite(weight).all()
+        ends = (
+            weight[:, 0] * (at[:, 0, 1] * 5 + at[:, 0, 0]) + weight[:, 1] * (at[:, 1, 1] * 5 + at[:, 1, 0])
+        ).sum()
+        starts = (
+            weight[:, 2] * (at[:, 2, 1] * 5 + at[:, 2, 0]) + weight[:, 3] * (at[:, 3, 1] * 5 + at[:, 3, 0])
+        ).sum()
+        assert ends - starts == pytest.approx(math.pi * radius**2, rel=1e-4)
