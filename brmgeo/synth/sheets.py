@@ -9,6 +9,7 @@ town gives the same bytes.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -126,7 +127,13 @@ def _write_sheet(
             f"sheet {number} holds no building of the generated town: choose sheets that meet {town.bounds}"
         )
     rng = np.random.default_rng([town.seed, 0xD7, index])
-    doc = new(version, setup=False, units=0 if version == "R12" else 6)
+    talk = logging.getLogger("ezdxf")
+    level = talk.level
+    talk.setLevel(logging.ERROR)  # it warns that R12 has no drawing units, whatever units it is given
+    try:
+        doc = new(version, setup=False, units=0 if version == "R12" else 6)
+    finally:
+        talk.setLevel(level)
     if version == "R12":
         doc.encoding = "cp949"
         doc.header["$DWGCODEPAGE"] = "ANSI_949"
