@@ -11,7 +11,7 @@ STAMP  := $(VENV)/.installed
 BRMGEO := $(BIN)/brmgeo
 export SCHEDULER
 
-.PHONY: help setup maps status localize evaluate demo test test-fast test-slow qgis-test bench bench-odometry lint check clean
+.PHONY: help setup maps status localize evaluate demo test test-slow qgis-test bench bench-odometry lint check clean
 
 help:  ## List these commands
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-14s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -52,7 +52,7 @@ qgis-test: maps localize  ## Open the demo's QGIS projects in a real QGIS, check
 
 bench: setup  ## Measure the kernels against their alternatives and rewrite the tables in docs/
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
-	$(BIN)/python benchmarks/ratio_maps.py
+	$(BIN)/python benchmarks/ratio_maps.py --full
 	$(BIN)/python benchmarks/dxf_readers.py --write docs/benchmarks-dxf.md
 	$(BIN)/python benchmarks/matchers.py
 

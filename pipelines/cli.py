@@ -80,9 +80,7 @@ def cli() -> None:
 @click.option(
     "--bounds", type=_Numbers(4), help="With --footprints: left,bottom,right,top where the map is known."
 )
-@click.option(
-    "--gsd", "gsd_m", type=float, default=0.5, show_default=True, help="With --footprints: metres per pixel."
-)
+@click.option("--gsd", "gsd_m", type=float, help="With --footprints: metres per pixel (default 0.5).")
 @click.option(
     "--radii",
     "radii_m",
@@ -106,7 +104,7 @@ def maps(
     imagery: Path | None,
     sheets: str | None,
     bounds: tuple[float, ...] | None,
-    gsd_m: float,
+    gsd_m: float | None,
     radii_m: tuple[float, ...] | None,
     layer: str | None,
     encoding: str | None,
@@ -130,7 +128,7 @@ def maps(
             imagery,
             sheets,
             bounds,
-            gsd_m,
+            0.5 if gsd_m is None else gsd_m,
             radii_m,
             layer,
             encoding,
@@ -143,7 +141,14 @@ def maps(
         raise SettingsError(
             "maps: give a REGION (such as demo), or --footprints FILE --crs EPSG:... --out DIR"
         )
-    given = {"--crs": crs, "--imagery": imagery, "--sheets": sheets, "--bounds": bounds, "--radii": radii_m}
+    given: dict[str, object] = {
+        "--crs": crs,
+        "--imagery": imagery,
+        "--sheets": sheets,
+        "--bounds": bounds,
+        "--radii": radii_m,
+    }
+    given |= {"--gsd": gsd_m, "--layer": layer, "--encoding": encoding, "--source-crs": source_crs}
     for option, value in given.items():
         if value is not None:
             raise SettingsError(
@@ -523,7 +528,14 @@ def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, writ
     from pipelines import logs as job
 
     if write is not None:
-        write.write_text(job.inspect_document(paths), encoding="utf-8")
+        text = job.inspect_document(paths)
+        if not write.absolute().parent.is_dir():
+            raise SettingsError(
+                f"inspect --write {write}: there is no folder {write.parent}; make it or choose another"
+            )
+        part = write.with_name(f".{write.name}.part")
+        part.write_text(text, encoding="utf-8")
+        part.replace(write)
         click.echo(f"wrote {write}")
         return
     options = LogOptions(topic, frame_times_s=job.times_of(times) if times else None)

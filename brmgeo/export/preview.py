@@ -90,7 +90,7 @@ def write_preview(
         above = 1 + 12 / panel_h_px
         what = "Imagery and buildings" if imagery is not None else "Buildings"
         left.text(0, above, what, transform=left.transAxes, fontsize=11.5, fontweight="bold", color=INK)
-        within = f" within {radius:g} m" if radius is not None else f", band {band}"
+        within = f" within {radius:.4g} m" if radius is not None else f", band {band}"
         right.text(
             0,
             above,

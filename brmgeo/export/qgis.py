@@ -110,7 +110,7 @@ def write_maps_project(
     ratios = [
         _Layer(
             f"ratio_{i}",
-            f"Within {radius:g} m" if radius is not None else f"Band {i}",
+            f"Within {radius:.4g} m" if radius is not None else f"Band {i}",
             f"./{ratio.name}",
             crs,
             style.ratio_style(i),

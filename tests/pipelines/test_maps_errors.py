@@ -444,3 +444,15 @@ def test_interrupted_runs_say_so(
     assert "the next run goes on from there" in said.err
     with open(region.data / "work" / "locks" / "small.lock", "rb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@pytest.mark.parametrize(
+    "option", [["--gsd", "0.25"], ["--layer", "x"], ["--encoding", "cp949"], ["--source-crs", "EPSG:5187"]]
+)
+def test_options_of_files_are_refused_beside_a_region(
+    option: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = brmgeo(capsys, "maps", "demo", *option)
+    assert said.status == 2
+    assert option[0] in said.error
+    assert "--footprints" in said.error
