@@ -196,6 +196,9 @@ def _write_sheet(
     _draw_texts(drawer, town, sheet, clipped)
     _draw_rest(drawer, town, sheet, rng)
     path = out_dir / f"{number}.dxf"
+    # ezdxf names the classes of the entities in use in the order of a set, which differs from process to process.
+    for dxf_type in sorted(doc.entitydb.dxf_types_in_use()):
+        doc.classes.add_class(dxf_type)
     doc.saveas(path)
     union = shapely.union_all(truths)
     return {

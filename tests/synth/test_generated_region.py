@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -48,6 +51,26 @@ def test_files_are_the_same_from_one_process_and_from_two(tmp_path: Path) -> Non
     assert manifest["tiles"] == len(expected)
     assert json.loads((one / "manifest.json").read_text(encoding="utf-8")) == manifest
     assert list(manifest["sheets"]) == list(SHEETS)
+
+
+def test_sheets_do_not_depend_on_the_order_of_sets(tmp_path: Path) -> None:
+    # Python draws the order of sets of text anew in every process: these two seeds order DXF classes differently.
+    script = (
+        "import sys; from pathlib import Path; from brmgeo.synth.sheets import write_sheets; "
+        "from brmgeo.synth.town import generate_town; "
+        f"write_sheets(generate_town({BOUNDS!r}, 3), Path(sys.argv[1]), {SHEETS!r})"
+    )
+    found = []
+    for seed in ("1", "4"):
+        out = tmp_path / seed
+        subprocess.run(
+            [sys.executable, "-c", script, str(out)],
+            check=True,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        )
+        found.append(digests(out))
+    assert set(found[0]) == {f"{s}.dxf" for s in SHEETS}
+    assert found[0] == found[1]
 
 
 def test_a_region_that_cannot_be_drawn_leaves_no_scratch_file(tmp_path: Path) -> None:
