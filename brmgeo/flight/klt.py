@@ -70,12 +70,12 @@ class KltTracker:
         self._now: NDArray[np.uint8] | None = None
         self._anchored = 0
         self._next_id = 0
+        self._surprise = np.inf  # how far off the predictions were last time, pixels
         self._raw: NDArray[np.uint8] | None = None
         self._clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
         self._flat = s.clahe_below > 255.0
         self._options: dict[str, Any] = {
             "winSize": (s.window_px, s.window_px),
-            "maxLevel": s.levels,
             "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
         }
 
@@ -88,33 +88,51 @@ class KltTracker:
         """
         s = self.settings
         self._raw = grey
-        grey = self._now = self._prepared(grey)
+        self._now = self._prepared(grey)
         if not len(self.px) or self._anchor is None:
             return np.empty(0, dtype=np.bool_)
         start = self.anchor_px.astype(np.float32)
         guess = (self.px if predicted_px is None else predicted_px).astype(np.float32)
         guess = np.where(np.isfinite(guess), guess, start)
-        flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+        # A patch half a window off is found without the coarse levels, which are most of the work.
+        levels = s.levels
+        if predicted_px is not None and self._surprise < s.window_px / 4.0:
+            levels = 0 if self._surprise < s.window_px / 10.0 else min(1, levels)
+        place, alive = self._match(start, guess, levels)
+        lost = np.flatnonzero(~alive)
+        if levels < s.levels and lost.size > 0.1 * len(alive):
+            place[lost], alive[lost] = self._match(start[lost], guess[lost], s.levels)
+        if alive.any():
+            off = np.abs(place - guess)[alive].max(axis=1)
+            self._surprise = float(np.partition(off, int(0.9 * off.size))[int(0.9 * off.size)])
+        self.px, self.anchor_px, self.ids = place[alive], self.anchor_px[alive], self.ids[alive]
+        return alive
+
+    def _match(
+        self, start: NDArray[np.float32], guess: NDArray[np.float32], levels: int
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        # Where the anchored patches are now, and which of them come back to where they started.
+        s = self.settings
+        assert self._anchor is not None
+        assert self._now is not None
+        options = self._options | {"flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
         there, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._anchor, self._now, start[:, None], guess[:, None].copy(), flags=flags, **self._options
-        )
-        # The way back begins where it should end: one level is enough.
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            self._now,
-            self._anchor,
-            there,
-            start[:, None].copy(),
-            flags=flags,
-            **(self._options | {"maxLevel": 1}),
+            self._anchor, self._now, start[:, None], guess[:, None].copy(), maxLevel=levels, **options
         )
         place = there[:, 0].astype(np.float64)
-        height, width = grey.shape
+        height, width = self._now.shape
         rim = s.window_px / 4.0
-        alive = (found[:, 0] > 0) & (returned[:, 0] > 0)
-        alive &= np.hypot(*(back[:, 0] - start).T) < s.forward_backward_px
+        alive = found[:, 0] > 0
         alive &= (place >= rim).all(axis=1) & (place <= [width - 1 - rim, height - 1 - rim]).all(axis=1)
-        self.px, self.anchor_px, self.ids = place[alive], self.anchor_px[alive], self.ids[alive]
-        return np.asarray(alive)
+        kept = np.flatnonzero(alive)
+        if kept.size:
+            # The way back begins where it should end: the finest level is enough.
+            back, returned, _ = cv2.calcOpticalFlowPyrLK(
+                self._now, self._anchor, there[kept], start[kept, None].copy(), maxLevel=0, **options
+            )
+            off = np.hypot(*(back[:, 0] - start[kept]).T)
+            alive[kept] = (returned[:, 0] > 0) & (off < s.forward_backward_px)
+        return place, np.asarray(alive)
 
     def _prepared(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self._flat:
@@ -180,3 +198,4 @@ class KltTracker:
     def forget(self) -> None:
         """Drop all points, after a gap."""
         self.keep(np.zeros(len(self.px), dtype=np.bool_))
+        self._surprise = np.inf

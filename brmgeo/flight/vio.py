@@ -33,6 +33,8 @@ from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu, Odometry
 GRAVITY = 9.80665
 # Error state: where each part begins. The clone (position, attitude) is last.
 P, V, TH, BG, BA, TD, BS, CP, CT, SIZE = 0, 3, 6, 9, 12, 15, 16, 19, 22, 25
+# What a picture sees of it: all but velocity and the biases.
+_SEEN = np.r_[P : P + 3, TH : TH + 3, TD : TD + 1, BS:SIZE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,13 +250,50 @@ def _tie(p, rot, pk, rotk, rbc, vel, omega, rays, seen, weight, matrix, vector):
         for c in range(25):
             jac[0, c] = (dy[0, c] - y[0] / y[2] * dy[2, c]) / y[2]
             jac[1, c] = (dy[1, c] - y[1] / y[2] * dy[2, c]) / y[2]
-        for a in range(25):
-            for b in range(a, 25):
-                s = weight[j] * (jac[0, a] * jac[0, b] + jac[1, a] * jac[1, b])
-                matrix[a, b] += s
-                if a != b:
-                    matrix[b, a] += s
-            vector[a] += weight[j] * (jac[0, a] * out[j, 0] + jac[1, a] * out[j, 1])
+        for k in range(_SEEN.size):
+            a = _SEEN[k]
+            ja, jb = weight[j] * jac[0, a], weight[j] * jac[1, a]
+            for m in range(k, _SEEN.size):
+                b = _SEEN[m]
+                matrix[a, b] += ja * jac[0, b] + jb * jac[1, b]
+            vector[a] += ja * out[j, 0] + jb * out[j, 1]
+    for k in range(_SEEN.size):
+        for m in range(k):
+            matrix[_SEEN[k], _SEEN[m]] = matrix[_SEEN[m], _SEEN[k]]
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _weigh(miss, base, focal, centred):  # type: ignore[no-untyped-def]
+    # Cauchy weights of residuals (n, 2) about their median, or about zero; what is far off is left out.
+    n = miss.shape[0]
+    du = dv = 0.0
+    if centred:
+        du, dv = np.median(miss[:, 0]), np.median(miss[:, 1])
+    size = np.empty(n)
+    for j in range(n):
+        size[j] = focal * math.hypot(miss[j, 0] - du, miss[j, 1] - dv)
+    scale = max(0.5, 1.5 * np.median(size))
+    weight = np.zeros(n)
+    inliers = 0
+    for j in range(n):
+        if size[j] < 5.0 * scale:
+            weight[j] = base[j] / (1.0 + (size[j] / scale) ** 2)
+            inliers += 1
+    return weight, inliers
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _density(at, height, width):  # type: ignore[no-untyped-def]
+    # Sum over points of bells of the given width, at equally spaced heights.
+    out = np.zeros(at.size)
+    step = at[1] - at[0]
+    for j in range(height.size):
+        reach = 6.0 * width[j]
+        low = max(0, int((height[j] - reach - at[0]) / step))
+        high = min(at.size, int((height[j] + reach - at[0]) / step) + 2)
+        for i in range(low, high):
+            out[i] += math.exp(-0.5 * ((at[i] - height[j]) / width[j]) ** 2) / width[j]
     return out
 
 
@@ -274,7 +313,7 @@ def ground_layer(height_m: FloatArray, sigma_m: FloatArray, least_share: float =
     width = np.maximum(sigma_m, 0.7)
     low, high = np.percentile(height_m, [1.0, 99.0])
     at = np.arange(low - 3.0, min(high, low + 150.0) + 3.5, 0.5)
-    density = (np.exp(-0.5 * ((at[:, None] - height_m) / width) ** 2) / width).sum(axis=1)
+    density = _density(at, np.asarray(height_m, dtype=np.float64), width)
     inner = density[1:-1]
     peak = (inner >= density[:-2]) & (inner > density[2:]) & (inner >= least_share * density.max())
     where = np.flatnonzero(peak)
@@ -552,7 +591,31 @@ class VioFilter:
         key, seen = np.ascontiguousarray(pts.key_ray[chosen]), np.ascontiguousarray(rays[chosen, :2])
         base = self._weights(chosen)
         weight = np.zeros(len(chosen))
-        prior = (
+        prior = self._state()
+        total = np.zeros(SIZE)
+        posterior = self.cov
+        for turn in range(2):
+            matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+            arguments = (self.p, self.rot, self.pk, self.rk, self.camera_mount, self.v, self.omega, key, seen)
+            miss = _tie(*arguments, np.zeros(len(chosen)), matrix, vector)
+            miss = np.where(np.isfinite(miss), miss, 1e3)  # a ray that does not meet the ground
+            weight, inliers = _weigh(miss, base, self.focal, turn == 0)
+            if inliers < s.min_tracks:
+                self._restore(prior)
+                return 0
+            _tie(*arguments, weight, matrix, vector)
+            vector += matrix @ total
+            gain = np.linalg.solve(np.eye(SIZE) + self.cov @ matrix, self.cov)
+            total = gain @ vector
+            self._restore(prior)
+            self._correct(total)
+            posterior = (gain + gain.T) / 2.0
+        self.cov = posterior
+        return int(inliers)
+
+    def _state(self) -> tuple[Any, ...]:
+        # All that _correct changes, in its order; it makes new arrays and leaves these as they are.
+        return (
             self.p,
             self.v,
             self.rot,
@@ -563,53 +626,19 @@ class VioFilter:
             self.pk,
             self.rk,
         )
-        total = np.zeros(SIZE)
-        inliers = 0
-        for turn in range(2):
-            matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-            arguments = (self.p, self.rot, self.pk, self.rk, self.camera_mount, self.v, self.omega, key, seen)
-            miss = _tie(*arguments, np.zeros(len(chosen)), matrix, vector)
-            miss = np.where(np.isfinite(miss), miss, 1e3)  # a ray that does not meet the ground
-            off = miss - (np.median(miss, axis=0) if turn == 0 else 0.0)
-            size = np.hypot(off[:, 0], off[:, 1]) * self.focal
-            scale = max(0.5, 1.5 * float(np.median(size)))
-            # Cauchy weights; what is far off is left out.
-            weight = np.where(size < 5.0 * scale, base / (1.0 + (size / scale) ** 2), 0.0)
-            inliers = int((weight > 0).sum())
-            if inliers < s.min_tracks:
-                break
-            _tie(*arguments, weight, matrix, vector)
-            vector += matrix @ total
-            gain = np.linalg.solve(np.eye(SIZE) + self.cov @ matrix, self.cov)
-            total = gain @ vector
-            (
-                self.p,
-                self.v,
-                self.rot,
-                self.gyro_bias,
-                self.accel_bias,
-                self.delay,
-                self.bore,
-                self.pk,
-                self.rk,
-            ) = prior
-            self._correct(total)
-            posterior = (gain + gain.T) / 2.0
-        if inliers < s.min_tracks:
-            (
-                self.p,
-                self.v,
-                self.rot,
-                self.gyro_bias,
-                self.accel_bias,
-                self.delay,
-                self.bore,
-                self.pk,
-                self.rk,
-            ) = prior
-            return 0
-        self.cov = posterior
-        return inliers
+
+    def _restore(self, state: tuple[Any, ...]) -> None:
+        (
+            self.p,
+            self.v,
+            self.rot,
+            self.gyro_bias,
+            self.accel_bias,
+            self.delay,
+            self.bore,
+            self.pk,
+            self.rk,
+        ) = state
 
     def _drop_strays(self, rays: FloatArray) -> None:
         # Points below the ground or far from where the plane, or their height, puts them: moving cars, wrong matches.
@@ -649,7 +678,7 @@ def run_vio(
     imu = Imu(*(np.ascontiguousarray(a, dtype=np.float64) for a in (imu.t_s, imu.gyro_rad_s, imu.accel_m_s2)))
     vio = VioFilter(camera, mount, imu, settings)
     n = len(times)
-    xyz, wxyz, velocity = np.empty((n, 3)), np.empty((n, 4)), np.empty((n, 3))
+    xyz, turned, velocity = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3))
     walk, yaw_sigma = np.empty(n), np.empty(n)
     tracks, blind = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
     segment = np.zeros(n, dtype=np.int64)
@@ -657,10 +686,11 @@ def run_vio(
     for i, grey in enumerate(images):
         tracks[i], blind[i] = vio.frame(float(times[i]), grey, float(agl_m[i]))
         xyz[i], velocity[i], segment[i] = vio.p, vio.v, vio.segment
-        wxyz[i] = Rotation.from_matrix(vio.rot).as_quat()[[3, 0, 1, 2]]
+        turned[i] = vio.rot
         walk[i], yaw_sigma[i] = vio.step_variance(), math.sqrt(max(0.0, float(vio.cov[TH + 2, TH + 2])))
         high += float(vio._high().mean()) if len(vio.points.sigma) else 0.0
     sigma = np.sqrt(np.maximum(np.diag(vio.cov), 0.0))
+    wxyz = Rotation.from_matrix(turned).as_quat()[:, [3, 0, 1, 2]]
     return VioResult(
         Odometry(times, xyz, wxyz, "embedded visual-inertial odometry", segment),
         np.maximum.accumulate(walk),
