@@ -27,6 +27,11 @@ KERNELS = {
     "brmgeo.flight.vio",
     "brmgeo.flight.klt",
     "brmgeo.flight.planar",
+    "brmgeo.segment.unet",
+    "brmgeo.segment.augment",
+    "brmgeo.segment.metrics",
+    "brmgeo.segment.tiles",
+    "brmgeo.segment.alignment",
 }
 ADAPTERS = {
     "brmgeo.ingest",
@@ -35,6 +40,7 @@ ADAPTERS = {
     "brmgeo.flight.logs",
     "brmgeo.flight.odometry",
     "brmgeo.flight.tables",
+    "brmgeo.segment.shards",
 }
 # What each room may import besides itself and plain values; everything not named here may not be known.
 MAY_KNOW = {
@@ -49,6 +55,7 @@ MAY_KNOW = {
     "brmgeo.export": VALUES,
     "brmgeo.evaluate": VALUES,
     "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
+    "brmgeo.segment": VALUES | {"brmgeo.maps"},
     "brmgeo.workflow": {"brmgeo.errors", "brmgeo"},
 }
 # Libraries that live in one room only.
@@ -56,6 +63,10 @@ ONLY_IN = {
     "dask": {"brmgeo.workflow"},
     "distributed": {"brmgeo.workflow"},
     "torch": {"brmgeo.segment"},
+    "safetensors": {"brmgeo.segment"},
+    "onnx": {"brmgeo.segment"},
+    "onnxscript": {"brmgeo.segment"},
+    "onnxruntime": {"brmgeo.segment"},
     "httpx": {"brmgeo.ingest"},
     "rosbags": {"brmgeo.flight.logs"},
     "pyulog": {"brmgeo.flight.logs"},
