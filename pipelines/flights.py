@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import InputError, MissingInputError, SettingsError, WorkflowError
 from brmgeo.evaluate.figures import (
     Background,
     Paths,
@@ -750,6 +750,14 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
     return rows
 
 
+def _trial_or_why(trial: Trial) -> list[FlightRow] | str:
+    # One flight that cannot be flown must not cost the others.
+    try:
+        return fly_trial(trial)
+    except Exception as error:
+        return f"seed {trial.seed}: {type(error).__name__}: {' '.join(str(error).split())}"
+
+
 def _half_hidden(maps: Maps, side: str) -> tuple[GroundMap, tuple[float, float, float, float]]:
     """The map without one half (cut away, unknown), and the bounds of that half."""
     building = maps.ground.building
@@ -780,7 +788,10 @@ def evaluate(
     out: Path,
     scheduler_spec: str | None,
 ) -> str:
-    """Flies many simulated flights, writes flights.csv, summary.md and returns the table as text."""
+    """Flies many simulated flights, writes flights.csv (as they land), summary.md and returns the table as text.
+
+    WorkflowError, after all is written, where a flight broke off.
+    """
     for method in methods:
         if method not in METHODS:
             raise SettingsError(f"method {method!r} is not known: choose among {', '.join(METHODS)}")
@@ -793,21 +804,41 @@ def evaluate(
     ]
     progress = Progress()
     rows: list[FlightRow] = []
+    broken: list[str] = []
+    out.mkdir(parents=True, exist_ok=True)
     with scheduler(scheduler_spec, say=progress.say) as map, progress.stage("flights") as bar:
-        for result in bar.watch(map)(fly_trial, trials):
-            rows += result
+        for result in bar.watch(map)(_trial_or_why, trials):
+            if isinstance(result, str):
+                broken.append(result)
+            else:
+                rows += result
+                _replace_text(out / "flights.csv", rows_csv(rows))
+    if not rows:
+        raise WorkflowError(f"evaluate: none of {flights} flights could be flown; {broken[0]}")
     where = "over ground that the map does not show" if hide else "over built-up ground"
     note = (
-        f"{flights} simulated masks-only flights ({path}, seeds {first_seed} to "
+        f"{flights - len(broken)} simulated masks-only flights ({path}, seeds {first_seed} to "
         f"{first_seed + flights - 1}) {where} of {maps.folder.name}; "
         f"odometry: simulated, scale bias {scale_bias:+.0%} or the opposite, heading drift 0.75 deg per root minute; "
         "masks: 12 % of buildings missed, 3 false blobs a frame, wobbly edges. Nothing is aligned before it is scored."
     )
+    if broken:
+        note += (
+            f" {len(broken)} of {flights} flights broke off and are not in the table: {'; '.join(broken)}."
+        )
     summaries = summarize(rows)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "flights.csv").write_text(rows_csv(rows), encoding="utf-8")
-    (out / "summary.md").write_text(f"{note}\n\n{markdown(summaries)}", encoding="utf-8")
+    _replace_text(out / "summary.md", f"{note}\n\n{markdown(summaries)}")
+    if broken:
+        raise WorkflowError(
+            f"evaluate: {len(broken)} of {flights} flights broke off ({broken[0]}); the others are in {out / 'flights.csv'}"
+        )
     return f"{note}\n\n{plain(summaries)}\n\nwritten: {out / 'flights.csv'}, {out / 'summary.md'}"
+
+
+def _replace_text(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
 
 
 def compare_results(folders: Sequence[Path], out: Path | None) -> str:
@@ -838,8 +869,8 @@ def compare_results(folders: Sequence[Path], out: Path | None) -> str:
     summaries = summarize(rows)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "flights.csv").write_text(rows_csv(rows), encoding="utf-8")
-        (out / "summary.md").write_text(markdown(summaries), encoding="utf-8")
+        _replace_text(out / "flights.csv", rows_csv(rows))
+        _replace_text(out / "summary.md", markdown(summaries))
     return plain(summaries)
 
 

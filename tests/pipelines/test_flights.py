@@ -682,3 +682,37 @@ def test_real_flight_without_odometry_is_honest(
     if "--max-speed" in words:
         assert metrics["share_converged"] > 0.1
         assert metrics["rmse_after_first_fix_m"] < 1.0
+
+
+def test_evaluate_keeps_the_flights_that_were_flown_where_one_breaks_off(
+    maps: Path, say: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly = job.fly_trial
+
+    def flown(trial: job.Trial) -> list[job.FlightRow]:
+        if trial.seed == 2:
+            raise ValueError("a root of\na negative number")
+        return fly(trial)
+
+    monkeypatch.setattr(job, "fly_trial", flown)
+    out = tmp_path / "table"
+    said = say(
+        "evaluate",
+        "--maps",
+        maps,
+        "--out",
+        out,
+        "--flights",
+        3,
+        "--methods",
+        "paper",
+        "--scheduler",
+        "serial",
+    )
+    assert "1 of 3 flights broke off (seed 2: ValueError: a root of a negative number)" in said.line
+    rows = csv.DictReader((out / "flights.csv").read_text(encoding="utf-8").splitlines())
+    assert [row["seed"] for row in rows] == ["1", "3"]
+    summary = (out / "summary.md").read_text(encoding="utf-8")
+    assert "2 simulated masks-only flights" in summary
+    assert "seed 2: ValueError" in summary
+    assert sorted(p.name for p in out.iterdir()) == ["flights.csv", "summary.md"]
