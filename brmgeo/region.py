@@ -163,24 +163,57 @@ class FlightSettings(_Settings):
 
 
 class TrainingSettings(_Settings):
-    """How training tiles are cut from the region; ``hold_out`` keeps the whole region for testing."""
+    """How training tiles are cut from the region; ``hold_out`` keeps the whole region for testing.
+
+    ``split``: ``blocks`` deals spatial blocks to training, validation and test; a split's name takes the whole region.
+    """
 
     tile_px: Annotated[int, Field(ge=64, le=2048, multiple_of=32)] = 512
     overlap_px: Annotated[int, Field(ge=0, le=1024)] = 128
-    gsd_m: tuple[Positive, ...] = (0.23, 0.35, 0.47)
+    gsd_m: tuple[Annotated[float, Field(ge=0.02, le=10)], ...] = (0.23, 0.35, 0.47)
     empty_share: Share = 0.2
     hold_out: bool = False
+    split: Literal["blocks", "train", "validation", "test"] = "blocks"
+    block_m: Annotated[float, Field(ge=50, le=100_000)] = 400.0
+    guard_m: Annotated[float, Field(ge=0, le=10_000)] = 20.0
+    validation_share: Share = 0.15
+    test_share: Share = 0.15
+    seed: Annotated[int, Field(ge=0)] = 0
+    min_known_share: Share = 0.5
+    max_cloud_share: Share = 0.5
+    image_format: Literal["jpg", "png"] = "jpg"
+    shard_tiles: Annotated[int, Field(ge=1, le=100_000)] = 256
 
     @field_validator("gsd_m", mode="before")
     @classmethod
     def _tuple(cls, value: Any) -> Any:
         return tuple(value) if isinstance(value, list) else value
 
+    @model_validator(mode="after")
+    def _sound(self) -> TrainingSettings:
+        if not self.gsd_m or len(set(self.gsd_m)) != len(self.gsd_m):
+            raise ValueError("'gsd_m' names no GSD, or one twice")
+        if self.overlap_px >= self.tile_px:
+            raise ValueError("'overlap_px' must be smaller than 'tile_px'")
+        if self.validation_share + self.test_share > 1:
+            raise ValueError("'validation_share' and 'test_share' are more than 1 together")
+        if self.hold_out and self.split in ("train", "validation"):
+            raise ValueError(
+                f"a region with hold_out = true is never trained on: leave split = {self.split!r} out, or hold_out"
+            )
+        return self
+
 
 class GenerateSettings(_Settings):
-    """A region made by brmgeo itself: a seed is the whole recipe."""
+    """A region made by brmgeo itself: a seed is the whole recipe.
+
+    ``style`` is a seed of its own for roofs, light, density and camera (the plain style where it is not given),
+    ``season`` the time of the year in place of the style's.
+    """
 
     seed: Annotated[int, Field(ge=0)]
+    style: Annotated[int, Field(ge=0)] | None = None
+    season: Literal["spring", "summer", "autumn", "winter"] | None = None
 
 
 class Region(_Settings):

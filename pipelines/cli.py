@@ -157,6 +157,74 @@ def maps(
     job.build_region(region, data, out, repairs, scheduler)
 
 
+@cli.command()
+@click.argument("regions", nargs=-1)
+@data_option
+@scheduler_option
+@click.option("--out", type=DATA, help="Where tiles go (default data/out/REGION/tiles); needed with --pairs.")
+@click.option(
+    "--split",
+    type=click.Choice(["blocks", "train", "validation", "test"]),
+    help="The split of all tiles, or blocks, in place of the region file's (with --pairs: train by default).",
+)
+@click.option(
+    "--gsd", "gsd_m", type=_Numbers(), help="Metres per pixel, in place of the region file's; of --pairs."
+)
+@click.option("--align", is_flag=True, help="Move the labels by their measured offset from the imagery.")
+@click.option(
+    "--pairs",
+    type=(DATA, DATA),
+    metavar="IMAGES MASKS",
+    help="Make tiles of foreign images and masks of the same names, without a REGION.",
+)
+@click.option("--name", help="With --pairs: what to call them (default: pairs).")
+@click.option("--attribution", help="With --pairs: whose pictures they are; it goes into tiles.json.")
+@click.option("--terms", default="", help="With --pairs: under which terms they may be used.")
+def tiles(
+    regions: tuple[str, ...],
+    data: Path,
+    scheduler: str | None,
+    out: Path | None,
+    split: str | None,
+    gsd_m: tuple[float, ...] | None,
+    align: bool,
+    pairs: tuple[Path, Path] | None,
+    name: str | None,
+    attribution: str | None,
+    terms: str,
+) -> None:
+    """Cut training tiles (image + label pairs) of REGIONS, or make them of foreign --pairs."""
+    from pipelines import training as job
+
+    if pairs is not None:
+        if regions or align:
+            raise SettingsError(
+                "tiles --pairs: leave REGION and --align out; pairs have neither map nor place"
+            )
+        if out is None or gsd_m is None or len(gsd_m) != 1 or not attribution:
+            raise SettingsError(
+                "tiles --pairs: give --out (a folder), --gsd (metres per pixel, one number) and --attribution"
+            )
+        if split == "blocks":
+            raise SettingsError(
+                "tiles --pairs: pairs have no place to make blocks of; give train, validation or test"
+            )
+        job.cut_pairs(*pairs, out, gsd_m[0], name or "pairs", split or "train", attribution, terms, scheduler)
+        return
+    if not regions:
+        raise SettingsError(
+            "tiles: give a REGION (such as demo), or --pairs IMAGES MASKS --gsd ... --out DIR"
+        )
+    if out is not None and len(regions) > 1:
+        raise SettingsError("tiles: --out takes one REGION; without it each goes to data/out/REGION/tiles")
+    for option, value in {"--name": name, "--attribution": attribution, "--terms": terms or None}.items():
+        if value is not None:
+            raise SettingsError(f"tiles: {option} goes with --pairs; a region's own is in its TOML file")
+    job.require_all_trainable(regions, data, split)
+    for region in regions:
+        job.cut_region(region, data, out, scheduler, split, gsd_m, align)
+
+
 @cli.command("new-region")
 @click.argument("name")
 @data_option

@@ -35,7 +35,7 @@ from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.stage import Json, Map, Stage
 from brmgeo.workflow.store import Artifact, Input, Step, Store, publish
-from pipelines.regions import region_named, where_to_get
+from pipelines.regions import region_named, town_style, where_to_get
 
 if TYPE_CHECKING:
     from brmgeo.ingest.footprints import Footprints
@@ -62,6 +62,7 @@ def run_source(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         settings["sheets"],
         crs=settings["crs"],
         level=settings["level"],
+        style=town_style(settings.get("style"), settings.get("season")),
         map=map,
     )
     return {
@@ -503,6 +504,8 @@ def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = Fals
                 "bounds": bounds,
                 "crs": region.crs,
                 "level": (region.imagery.level if region.imagery else None) or 1,
+                # Only where they are given: a region without them keeps its key.
+                **region.generate.model_dump(include={"style", "season"}, exclude_none=True),
             },
         )
     files = _generated_files(region, generated) if generated else find_sources(region, source_dir)

@@ -8,6 +8,7 @@ import os
 import re
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pyproj import Transformer
 
@@ -24,6 +25,9 @@ from brmgeo.geo.crs import (
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import sheet_extent, sheets_covering
 from brmgeo.region import Region, load_region
+
+if TYPE_CHECKING:
+    from brmgeo.synth.scene import TownStyle
 
 MAX_AREA_M2 = 1e10
 NGII = "https://map.ngii.go.kr"
@@ -60,6 +64,16 @@ def region_named(name: str, data: Path) -> tuple[Region, Path]:
     if name.endswith(".toml") or "/" in name:
         return load_region(Path(name)), data
     return load_region(data / "regions" / f"{name}.toml"), data
+
+
+def town_style(style: int | None, season: str | None) -> TownStyle | None:
+    """The style of a generated region by the keys of its [generate]; None, the plain one, without them."""
+    from brmgeo.synth.scene import TownStyle
+
+    if style is None and season is None:
+        return None
+    drawn = TownStyle() if style is None else TownStyle.varied(style)
+    return drawn if season is None else drawn.with_season(season)  # type: ignore[arg-type]
 
 
 def new_region(

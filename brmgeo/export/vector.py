@@ -1,4 +1,4 @@
-"""Point and line features out: RFC 7946 GeoJSON lines and GeoPackage layers, the same bytes for the same values."""
+"""Point, line and polygon features out: RFC 7946 GeoJSON lines and GeoPackage layers, the same bytes for the same values."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def write_layer(
     path: Path,
     layer: str,
     geometry: Any,
-    geometry_type: Literal["Point", "LineString"],
+    geometry_type: Literal["Point", "LineString", "Polygon"],
     crs: str,
     columns: Mapping[str, NDArray[Any]],
 ) -> None:

@@ -153,6 +153,18 @@ def check_imagery(sources: Sequence[ImagerySource], box: GeoBox) -> None:
         )
 
 
+def native_gsd_m(sources: Sequence[ImagerySource], box: GeoBox) -> float:
+    """Ground metres per pixel of the coarsest of the sources, at the middle of a lattice (projected, metres).
+
+    Raises as ``mosaic_to_lattice``.
+    """
+    found = 0.0
+    for source in sources:
+        with _plane_of(source) as plane:
+            found = max(found, gsd_of(box) / max(min(_scale(plane, box)), 1e-12))
+    return found
+
+
 def imagery_credits(sources: Sequence[ImagerySource | TileService]) -> tuple[str, str]:
     """(attribution, terms) of all sources, each said once: what the outputs' metadata must carry."""
     return (

@@ -1,0 +1,604 @@
+"""Training tiles: imagery and footprints in; 512 x 512 pairs of image and label, their splits, statistics and map out.
+
+The stages go on from those of the maps (``source``, ``outlines``, ``lattice``, ``footprints``): ``alignment`` (how far the
+labels lie beside the imagery), ``tile-survey`` (every tile that could be cut, its split, and why it is left out), ``tiles``
+(one step a shard), ``tile-index``.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from affine import Affine
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from brmgeo.errors import InputError, SettingsError
+from brmgeo.geo.crs import transform_bounds
+from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
+from brmgeo.region import Region, TrainingSettings, load_region
+from brmgeo.segment.shards import (
+    FORMAT,
+    INDEX_CSV,
+    TILES_JSON,
+    VERSION,
+    ShardWriter,
+    TileInfo,
+    entry_row,
+    write_index,
+)
+from brmgeo.segment.tiles import (
+    SPLITS,
+    Splits,
+    Tally,
+    make_label,
+    one_split,
+    picture_fault,
+    sample_empty,
+    shares,
+    spatial_splits,
+    tile_windows,
+)
+from brmgeo.workflow.plan import Plan
+from brmgeo.workflow.progress import Progress
+from brmgeo.workflow.schedule import scheduler
+from brmgeo.workflow.stage import Json, Map, Stage
+from brmgeo.workflow.store import Artifact, Input, Store, publish
+from pipelines import maps
+from pipelines.maps import Inputs, read_lattice
+from pipelines.regions import region_named
+
+COARSE = 8  # the survey looks at imagery in pixels this many times larger
+FINEST = 1.3  # tiles may be this many times finer than their imagery, no more: upsampled pictures teach blur
+SURVEY_TILES = 64
+
+
+# --- tile-survey: every tile that could be cut ------------------------------------------------------------------
+
+
+def run_survey(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
+    """Writes survey.json: all candidates with their split and shares, and why those that are not kept are left out."""
+    from brmgeo.ingest.imagery import native_gsd_m
+
+    box, _ = read_lattice(inputs["lattice"])
+    native = native_gsd_m(_sources(inputs, settings), box)
+    fine = [g for g in settings["gsd_m"] if g * FINEST < native]
+    gsds = [g for g in settings["gsd_m"] if g not in fine]
+    if not gsds:
+        raise SettingsError(
+            f"region {settings['region']}: its imagery has {native:.3g} m per pixel, much coarser than all of the "
+            f"training.gsd_m {maps._listed([f'{g:g}' for g in fine])}: give coarser ones, or finer imagery"
+        )
+    grids = {g: _grid(box, g) for g in gsds}
+    todo = [
+        (g, first, windows[first : first + SURVEY_TILES])
+        for g in gsds
+        for windows in [tile_windows(maps._shape(grids[g]), settings["tile_px"], settings["overlap_px"])]
+        for first in range(0, len(windows), SURVEY_TILES)
+    ]
+    work = functools.partial(_survey_some, dict(inputs), json.dumps(settings))
+    found = [tile for some in map(work, todo) for tile in some]
+    ground = _ground_of(found)
+    for g in gsds:
+        for split in SPLITS:
+            own = [t for t in found if t["gsd_m"] == g and t["split"] == split and not t["dropped"]]
+            empty = [t["key"] for t in own if t["built"] == 0]
+            kept = sample_empty(len(own) - len(empty), empty, settings["empty_share"], settings["seed"])
+            for tile in own:
+                if tile["built"] == 0 and tile["key"] not in kept:
+                    tile["dropped"] = "empty"
+    dropped = Counter(t["dropped"] or "kept" for t in found)
+    facts = {
+        "candidates": len(found),
+        "kept": dropped.pop("kept", 0),
+        "dropped": dict(sorted(dropped.items())),
+        "imagery_gsd_m": round(native, 4),
+        "gsd_m": gsds,
+        "gsd_too_fine_m": fine,
+        "ground": ground,
+    }
+    (out / "survey.json").write_text(json.dumps({"facts": facts, "tiles": found}), encoding="utf-8")
+    return facts
+
+
+def _ground_of(found: Sequence[Json]) -> Json:
+    """What the ground is like before tiles without buildings are sampled down, from the tiles with map and imagery."""
+    known = [t for t in found if t["known"] > 0 and t["dropped"] in (None, "guard")]
+    weight = sum(t["known"] for t in known)
+    return {
+        "tiles": len(known),
+        "empty": sum(t["built"] == 0 for t in known),
+        "building_share": round(sum(t["built"] * t["known"] for t in known) / weight, 6) if weight else None,
+    }
+
+
+def _grid(box: GeoBox, gsd_m: float) -> GeoBox:
+    """The lattice of tiles at one GSD over the region's."""
+    return lattice(bounds_of(box), str(box.crs), gsd_m)
+
+
+def _sources(inputs: Inputs, settings: Json) -> list[Any]:
+    files = settings["source"]["files"]
+    root = str(inputs[files[0]].parent if files else inputs["imagery"])
+    return maps._imagery_sources(json.dumps(settings["source"]), root)
+
+
+def _splits(settings: Json) -> Splits:
+    bounds = maps._bounds(settings["bounds"])
+    if settings["split"] != "blocks":
+        return one_split(bounds, settings["split"])
+    return spatial_splits(
+        bounds,
+        settings["block_m"],
+        settings["guard_m"],
+        settings["validation_share"],
+        settings["test_share"],
+        settings["seed"],
+    )
+
+
+def _survey_some(inputs: Inputs, text: str, todo: tuple[float, int, list[Window]]) -> list[Json]:
+    """The candidates of one GSD from the ``first`` on."""
+    from brmgeo.ingest.imagery import mosaic_to_lattice
+
+    settings = json.loads(text)
+    gsd_m, first, windows = todo
+    box, _ = read_lattice(inputs["lattice"])
+    grid, splits = _grid(box, gsd_m), _splits(settings)
+    held = [shapely.box(*b) for _, b in settings["held"]]
+    found: list[Json] = []
+    for number, window in enumerate(windows, start=first):
+        own = window.box_in(grid)
+        bounds = bounds_of(own)
+        tile: dict[str, Any] = {
+            "key": f"{settings['region']}-{round(gsd_m * 1000):04d}-{number:05d}",
+            "number": number,
+            "gsd_m": gsd_m,
+            "row": window.row,
+            "col": window.col,
+            "bounds": [round(v, 6) for v in bounds],
+            "split": splits.of(bounds),
+            "built": 0.0,
+            "known": 0.0,
+            "dropped": None,
+        }
+        found.append(tile)
+        if any(area.intersects(shapely.box(*bounds)) for area in held):
+            tile["dropped"] = "held-out ground"
+            continue
+        mask = _mask(inputs, own)
+        a = own.affine
+        coarse = Affine(a.a * COARSE, 0.0, a.c, 0.0, a.e * COARSE, a.f)
+        small = GeoBox((window.height // COARSE, window.width // COARSE), coarse, grid.crs)
+        rgb, seen = mosaic_to_lattice(_sources(inputs, settings), small)
+        label = make_label(mask, np.repeat(np.repeat(seen, COARSE, axis=0), COARSE, axis=1))
+        built, known = shares(label)
+        tile["built"], tile["known"] = round(built, 6), round(known, 6)
+        if known < settings["min_known_share"] or known == 0:
+            tile["dropped"] = "unknown"
+        else:
+            tile["dropped"] = picture_fault(rgb, seen, settings["max_cloud_share"])
+        if tile["dropped"] is None and tile["split"] is None:
+            tile["dropped"] = "guard"
+    return found
+
+
+def _mask(inputs: Inputs, own: GeoBox) -> NDArray[np.uint8]:
+    """(h, w) uint8 building mask of one tile, drawn at its own GSD from the footprints that touch it."""
+    from pyogrio.raw import read as read_raw
+
+    from brmgeo.maps.rasterize import mask_window
+
+    _, known = read_lattice(inputs["lattice"])
+    left, bottom, right, top = bounds_of(own)
+    reach = own.affine.a
+    touched = (left - reach, bottom - reach, right + reach, top + reach)
+    wkb = read_raw(inputs["footprints"] / "footprints.gpkg", layer="footprints", columns=[], bbox=touched)[2]
+    return mask_window(shapely.from_wkb(wkb), [p for _, p in known], own)
+
+
+@functools.lru_cache(maxsize=2)
+def _surveyed(folder: Path) -> tuple[Json, ...]:
+    """The tiles of a survey that are kept."""
+    text = json.loads((folder / "survey.json").read_text(encoding="utf-8"))
+    return tuple(t for t in text["tiles"] if t["dropped"] is None)
+
+
+# --- tiles: one shard ---------------------------------------------------------------------------------------------
+
+
+def run_tiles(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
+    """Writes shard.tar with the kept tiles of one stretch of the survey, and entries.json: its index and counts."""
+    from brmgeo.ingest.imagery import mosaic_to_lattice
+
+    first, last = settings["first"], settings["first"] + settings["count"]
+    own = [
+        t
+        for t in _surveyed(inputs["survey"])
+        if t["gsd_m"] == settings["gsd_m"] and first <= t["number"] < last
+    ]
+    rows, tallies = [], {split: Tally() for split in SPLITS}
+    if own:
+        box, _ = read_lattice(inputs["lattice"])
+        grid = _grid(box, settings["gsd_m"])
+        with ShardWriter(out / "shard.tar", image_format=settings["image_format"]) as shard:
+            for tile in own:
+                window = Window(tile["row"], tile["col"], settings["tile_px"], settings["tile_px"])
+                place = window.box_in(grid)
+                rgb, seen = mosaic_to_lattice(_sources(inputs, settings), grid, window)
+                label = make_label(_mask(inputs, place), seen)
+                built, known = shares(label)
+                info = TileInfo(
+                    tile["key"],
+                    0,
+                    tile["gsd_m"],
+                    tile["split"],
+                    settings["region"],
+                    round(built, 6),
+                    round(known, 6),
+                    bounds_of(place),
+                    str(box.crs),
+                )
+                shard.add(info, rgb, label)
+                tallies[tile["split"]].add(rgb, label)
+        rows = [entry_row(entry) for entry in shard.entries]
+    _write_entries(out, rows, tallies)
+    return {"tiles": len(rows)}
+
+
+def _write_entries(out: Path, rows: Sequence[Json], tallies: Mapping[str, Tally]) -> None:
+    text = {"rows": rows, "tallies": {split: asdict(tally) for split, tally in tallies.items()}}
+    (out / "entries.json").write_text(json.dumps(text), encoding="utf-8")
+
+
+# --- tile-index: what a person and a program look at first --------------------------------------------------------
+
+
+def run_index(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
+    """Writes index.csv, index.gpkg (where the tiles' places are known) and tiles.json over all shards."""
+    rows: list[Json] = []
+    shards: list[Json] = []
+    tallies = {split: Tally() for split in SPLITS}
+    for name in settings["shards"]:
+        folder = inputs[name]
+        text = json.loads((folder / "entries.json").read_text(encoding="utf-8"))
+        for split, tally in text["tallies"].items():
+            tallies[split].merge([Tally(**tally)])
+        if not text["rows"]:
+            continue
+        rows += [row | {"shard": len(shards)} for row in text["rows"]]
+        shards.append(
+            {
+                "file": f"{name}.tar",
+                "size": (folder / "shard.tar").stat().st_size,
+                "tiles": len(text["rows"]),
+            }
+        )
+    if not rows:
+        raise InputError(
+            f"{settings['region']}: no tile is left: {json.dumps(settings['facts'].get('dropped', {}))} were left out; "
+            "check the map, the imagery and [training]"
+        )
+    write_index(out / INDEX_CSV, rows)
+    facts = dict(settings["facts"])
+    if "survey" in inputs:
+        facts |= json.loads((inputs["survey"] / "survey.json").read_text(encoding="utf-8"))["facts"]
+    placed = all(row["left"] is not None for row in rows)
+    if placed:
+        _write_gpkg(out / "index.gpkg", rows, settings["credit"])
+    statistics = next(split for split in SPLITS if tallies[split].tiles)
+    whole = {
+        "format": FORMAT,
+        "version": VERSION,
+        "region": settings["region"],
+        "title": settings["title"],
+        "hold_out": settings["hold_out"],
+        "tiles": len(rows),
+        "tile_px": settings["tile_px"],
+        "overlap_px": settings["overlap_px"],
+        "labels": {"0": "other", "127": "unknown", "255": "building"},
+        "by_gsd_m": _counted(rows, "gsd_m"),
+        "by_split": _counted(rows, "split"),
+        "splits": {split: _told(tally) for split, tally in tallies.items() if tally.tiles},
+        # What a network's input is normalised with; from training tiles wherever there are some.
+        "statistics": {"split": statistics} | _colour_told(tallies[statistics]),
+        "survey": facts,
+        "blocks": settings["blocks"],
+        "sources": settings["sources"],
+        "shards": shards,
+    }
+    (out / TILES_JSON).write_text(json.dumps(whole, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return {"tiles": len(rows), "by_split": whole["by_split"], "shards": len(shards)}
+
+
+def _counted(rows: Sequence[Json], column: str) -> Json:
+    return {str(name): count for name, count in sorted(Counter(row[column] for row in rows).items())}
+
+
+def _told(tally: Tally) -> Json:
+    known = tally.building + tally.other
+    return {
+        "tiles": tally.tiles,
+        "empty_tiles": tally.empty,
+        "empty_share": round(tally.empty / tally.tiles, 4),
+        "pixels": {"building": tally.building, "other": tally.other, "unknown": tally.unknown},
+        "building_share": round(tally.building / known, 6) if known else None,
+        # How many other pixels stand against one of a building: the weight that evens them out.
+        "other_per_building": round(tally.other / tally.building, 4) if tally.building else None,
+        **_colour_told(tally),
+    }
+
+
+def _colour_told(tally: Tally) -> Json:
+    colour = tally.colour()
+    if colour is None:
+        return {"mean": None, "std": None}
+    return {"mean": [round(v, 6) for v in colour[0]], "std": [round(v, 6) for v in colour[1]]}
+
+
+def _write_gpkg(path: Path, rows: Sequence[Json], credit: str) -> None:
+    """index.gpkg: one polygon a tile, coloured by split when QGIS opens it."""
+    from brmgeo.export.qgis_style import add_default_styles, categorized, fill
+    from brmgeo.export.vector import write_layer
+
+    colours = {"train": "#2f6bff", "validation": "#ffb02e", "test": "#e0457b"}
+    boxes = np.array([shapely.box(*(row[n] for n in ("left", "bottom", "right", "top"))) for row in rows])
+    columns: dict[str, NDArray[Any]] = {
+        name: np.array([row[name] for row in rows], dtype=object)
+        for name in ("key", "region", "split", "image_name")
+    }
+    for name in ("gsd_m", "building_share", "known_share"):
+        columns[name] = np.array([row[name] for row in rows], dtype=np.float64)
+    columns["shard"] = np.array([row["shard"] for row in rows], dtype=np.int64)
+    columns["source"] = np.array([credit] * len(rows), dtype=object)
+    write_layer(path, "tiles", boxes, "Polygon", rows[0]["crs"], columns)
+    style = categorized(
+        "split", [(name, name.capitalize(), [fill(c, 45, c, 0.4)]) for name, c in colours.items()]
+    )
+    add_default_styles(path, {"tiles": ([style], "Polygon")})
+
+
+SURVEY = Stage("tile-survey", 1, run_survey)
+TILES = Stage("tiles", 1, run_tiles)
+INDEX = Stage("tile-index", 1, run_index)
+
+
+# --- the plan -----------------------------------------------------------------------------------------------------
+
+
+def plan_tiles(region: Region, store: Store, data: Path, fetch: bool = False) -> tuple[Plan, dict[str, str]]:
+    """The steps of a region's training tiles, and the label of each shard's step -> the shard's name.
+
+    Raises SettingsError for a region without imagery, and as ``plan_maps``.
+    """
+    if region.imagery is None:
+        raise SettingsError(
+            f"region {region.name} has no imagery, so no training tile can be cut: add [imagery] to its region file"
+        )
+    whole = maps.plan_maps(region, store, data / "source" / region.name, fetch)
+    plan = Plan(store, region.name)
+    for label, step in whole.steps.items():
+        if label not in ("imagery", "buildings", "ratio", "overview"):
+            plan.steps[label] = step
+    imagery = whole.steps["imagery"]
+    own = region.training
+    inputs: dict[str, Input] = {
+        **{name: item for name, item in imagery.inputs.items() if name != "lattice"},
+        "lattice": plan.steps["lattice"],
+        "footprints": plan.steps["footprints"],
+    }
+    box = lattice(maps._place(region), region.crs, region.gsd_m)
+    cut = {
+        "region": region.name,
+        "source": imagery.settings["source"],
+        "tile_px": own.tile_px,
+    }
+    rules = own.model_dump(
+        include={
+            "overlap_px", "gsd_m", "empty_share", "split", "block_m", "guard_m", "validation_share", "test_share", "seed",
+            "min_known_share", "max_cloud_share",
+        }
+    )  # fmt: skip
+    if own.hold_out:
+        rules["split"] = "test"
+    survey = plan.add(
+        SURVEY,
+        inputs,
+        cut | rules | {"bounds": bounds_of(box), "held": held_ground(region, data)},
+    )
+    names: dict[str, str] = {}
+    for gsd_m in own.gsd_m:
+        count = len(tile_windows(maps._shape(_grid(box, gsd_m)), own.tile_px, own.overlap_px))
+        for number, first in enumerate(range(0, count, own.shard_tiles)):
+            name = f"{region.name}-{round(gsd_m * 1000):04d}-{number:03d}"
+            plan.add(
+                TILES,
+                inputs | {"survey": survey},
+                cut
+                | {
+                    "gsd_m": gsd_m,
+                    "first": first,
+                    "count": own.shard_tiles,
+                    "image_format": own.image_format,
+                },
+                f"tiles {name}",
+            )
+            names[f"tiles {name}"] = name
+    blocks = _splits(json.loads(json.dumps(rules | {"bounds": bounds_of(box)})))
+    plan.add(
+        INDEX,
+        {"survey": survey} | {name: plan.steps[label] for label, name in names.items()},
+        {
+            "region": region.name,
+            "title": region.title,
+            "hold_out": own.hold_out,
+            "tile_px": own.tile_px,
+            "overlap_px": own.overlap_px,
+            "shards": list(names.values()),
+            "facts": {},
+            "blocks": {
+                "guard_m": blocks.guard_m,
+                "blocks": [[name, *blocks.block(i)] for i, name in enumerate(blocks.names)],
+            },
+            "credit": maps.credits(region),
+            "sources": [
+                {
+                    "what": "imagery",
+                    "attribution": region.imagery.attribution,
+                    "terms": region.imagery.terms,
+                },
+                {"what": "footprints", "attribution": region.footprints.attribution, "terms": ""},
+            ],
+        },
+    )
+    return plan, names
+
+
+# --- who may be trained on ------------------------------------------------------------------------------------------
+
+
+def flights_over(name: str, data: Path) -> list[str]:
+    """Names of the flights, own or simulated, that lie below a region's folders."""
+    found = {p.parent.name for p in (data / "source" / name / "flights").glob("*/flight.toml")}
+    found |= {p.name for p in (data / "out" / name / "flights").glob("*") if p.is_dir()}
+    return sorted(found)
+
+
+def require_trainable(region: Region, data: Path) -> None:
+    """Raises SettingsError (one line) for a region that must not be trained on: held out, or flown over."""
+    if region.training.hold_out:
+        raise SettingsError(
+            f"region {region.name} is held out (training.hold_out = true in its region file), so it is never trained on: "
+            "name other regions, or cut it for testing only"
+        )
+    flown = flights_over(region.name, data)
+    if flown:
+        raise SettingsError(
+            f"region {region.name} is flown over by {maps._listed(flown)}, so it is never trained on: set training.hold_out "
+            "= true in its region file to cut it for testing, or train on other regions"
+        )
+
+
+def require_all_trainable(names: Sequence[str], data: Path, split: str | None) -> list[tuple[Region, Path]]:
+    """The regions of these names, checked before the first is worked on: see ``require_trainable``.
+
+    ``split`` is what the user asks for in place of the region files' own; tiles for testing may be cut anywhere.
+    """
+    found = []
+    for name in names:
+        region, own = region_named(name, data)
+        wanted = split or ("test" if region.training.hold_out else region.training.split)
+        if wanted != "test":
+            require_trainable(region, own)
+        found.append((region, own))
+    return found
+
+
+def held_ground(region: Region, data: Path) -> list[tuple[str, Bounds]]:
+    """Names and bounds, in the region's CRS, of real held-out or flown regions: no tile of another region may show them.
+
+    Generated regions only borrow their coordinates: two that overlap show different towns.
+    """
+    found: list[tuple[str, Bounds]] = []
+    if region.generate is not None or region.training.hold_out or region.training.split == "test":
+        return found
+    own = shapely.box(*maps._place(region))
+    for path in sorted((data / "regions").glob("*.toml")):
+        if path.stem.startswith("_") or path.stem == region.name:
+            continue
+        try:
+            other = load_region(path)
+        except SettingsError:
+            continue  # whoever uses that region is told
+        if other.generate is not None or not (
+            other.training.hold_out or other.training.split == "test" or flights_over(other.name, data)
+        ):
+            continue
+        place = transform_bounds(other.crs, region.crs, maps._place(other))
+        grown = shapely.box(*place).buffer(region.training.guard_m, join_style="mitre")
+        if grown.intersects(own):
+            found.append((other.name, maps._bounds(grown.bounds)))
+    return found
+
+
+# --- the jobs that the command line calls ---------------------------------------------------------------------------
+
+
+def cut_region(
+    name: str,
+    data: Path,
+    out: Path | None,
+    scheduler_spec: str | None,
+    split: str | None = None,
+    gsd_m: Sequence[float] | None = None,
+    align: bool = False,
+) -> Path:
+    """Cuts the training tiles of a region and publishes them; the folder they are in.
+
+    Raises SettingsError for a region that is held out or flown over, unless all its tiles are for testing.
+    """
+    region, data = require_all_trainable([name], data, split)[0]
+    changes: dict[str, Any] = {}
+    if split is not None:
+        changes["split"] = split
+    if gsd_m is not None:
+        changes["gsd_m"] = tuple(gsd_m)
+    if changes:
+        region = region.model_copy(update={"training": _changed(region.training, changes)})
+    return cut_tiles(region, data, out or data / "out" / region.name / "tiles", scheduler_spec)
+
+
+def _changed(settings: TrainingSettings, changes: Mapping[str, Any]) -> TrainingSettings:
+    from pydantic import ValidationError
+
+    from brmgeo.region import describe_fault
+
+    try:
+        return TrainingSettings.model_validate(settings.model_dump() | dict(changes))
+    except ValidationError as error:
+        raise SettingsError(f"tiles: {describe_fault(error, TrainingSettings)}") from None
+
+
+def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None) -> Path:
+    """Builds what is missing of a region's training tiles and publishes them in ``out``."""
+    progress = Progress()
+    maps._require_writable(out)
+    store = Store(data / "work")
+    with store.lock(region.name):
+        plan, names = plan_tiles(region, store, data, fetch=True)
+        with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
+            made = plan.build(map, progress)
+        _publish(made, names, out)
+    facts = made["tile-index"].facts
+    told = ", ".join(f"{count} {split}" for split, count in facts["by_split"].items())
+    survey = made["tile-survey"].facts
+    if survey["gsd_too_fine_m"]:
+        progress.say(
+            f"{region.name}: nothing cut at {maps._listed([f'{g:g} m' for g in survey['gsd_too_fine_m']])}: much finer than "
+            f"the imagery's {survey['imagery_gsd_m']:g} m per pixel"
+        )
+    progress.say(
+        f"{region.name}: {facts['tiles']} tiles ({told}) in {facts['shards']} shards; results are in {out}"
+    )
+    return out
+
+
+def _publish(made: Mapping[str, Artifact], names: Mapping[str, str], out: Path) -> None:
+    wanted = set()
+    for label, name in names.items():
+        if (made[label].path / "shard.tar").exists():
+            publish(made[label], out, {"shard.tar": f"{name}.tar"})
+            wanted.add(f"{name}.tar")
+    index = made["tile-index"]
+    publish(index, out, sorted(index.record["outputs"]))
+    for stale in out.glob("*.tar"):
+        if stale.name not in wanted:
+            stale.unlink()
