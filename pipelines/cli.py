@@ -345,6 +345,8 @@ def simulate(
         if season is not None:
             picture = job.other_day(own, folder, season, seed, Path(scratch) / "other-day.tif")
             what = replace(what, imagery=picture)
+        elif region is not None and mode != "masks":
+            what = replace(what, native=job.native_imagery(own, data))
         if count is None:
             name = name or f"simulated-{seed}"
             click.echo(f"wrote {job.simulate_flight(what, seed, out or flights / name, name)}")

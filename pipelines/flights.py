@@ -51,6 +51,7 @@ from brmgeo.match import (
 from brmgeo.region import FlightSettings, Region
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
+from pipelines.maps import NativeImagery, native_imagery
 from pipelines.regions import region_named
 
 FloatArray = NDArray[np.float64]
@@ -600,6 +601,7 @@ class Simulation:
         scale_bias: of the odometry; None draws it.
         no_odometry, compass: what the aircraft carries.
         imagery: a (h, w, 3) picture by path in place of the maps' own, for flights on another day; None for the maps'.
+        native: the region's imagery where that is finer than its maps: frames are drawn from it.
     """
 
     maps_dir: Path
@@ -610,6 +612,7 @@ class Simulation:
     no_odometry: bool = False
     compass: bool = False
     imagery: Path | None = None
+    native: NativeImagery | None = None
 
     def imagery_file(self) -> Path | None:
         """The picture that frames are drawn from; None where none are drawn."""
@@ -648,7 +651,11 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     settings = simulator_settings(what.own, **changes)
     route = flight_path(what.path, ground, seed, maps.bounds, maps.crs)
     file, imagery = what.imagery_file(), None
-    if file is not None:
+    if file is not None and what.imagery is None and what.native is not None:
+        reach = what.own.agl_m * math.tan(math.radians(what.own.fov_deg) / 2) * 2.5 + 60.0
+        (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
+        imagery = Imagery(*what.native.around((left, bottom, right, top)), what.native.gsd_m)
+    elif file is not None:
         box = box_of(file)
         left, _, _, top = bounds_of(box)
         imagery = Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
@@ -913,13 +920,15 @@ def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
             "seed": seed,
             "mode": mode,
             "flight": own.flight.model_dump(),
+            "imagery": None if own.imagery is None else own.imagery.model_dump(mode="json"),
             "footprints": _digest(maps.footprints),
         }
     )
     note = out / ".recipe.json"
     if not note.is_file() or note.read_text(encoding="utf-8") != recipe:
         Progress().say(f"{name}: simulating the paper's rectangle over {own.name} (seed {seed})")
-        simulate_flight(Simulation(maps.folder, own.flight, mode=mode), seed, out, name)
+        native = native_imagery(own, data) if mode == "both" else None
+        simulate_flight(Simulation(maps.folder, own.flight, mode=mode, native=native), seed, out, name)
         note.write_text(recipe, encoding="utf-8")
     return out
 

@@ -10,6 +10,7 @@ import functools
 import glob
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections import Counter
@@ -286,6 +287,42 @@ def _imagery_block(source: str, root: str, lattice_dir: Path, window: Window) ->
 
     box, _ = read_lattice(lattice_dir)
     return mosaic_to_lattice(_imagery_sources(source, root), box, window)
+
+
+@dataclass(frozen=True, slots=True)
+class NativeImagery:
+    """A region's imagery at its sources' own metres per pixel, cut where it is asked for; small, so that it travels."""
+
+    source: str
+    root: str
+    crs: str
+    gsd_m: float
+
+    def around(self, bounds: Bounds) -> tuple[NDArray[np.uint8], float, float]:
+        """(rgb (h, w, 3), left, top) over (left, bottom, right, top); pixels that no source knows are 0."""
+        from brmgeo.ingest.imagery import mosaic_to_lattice
+
+        box = lattice(bounds, self.crs, self.gsd_m)
+        left, _, _, top = bounds_of(box)
+        return mosaic_to_lattice(_imagery_sources(self.source, self.root), box)[0], left, top
+
+
+def native_imagery(region: Region, data: Path) -> NativeImagery | None:
+    """The imagery that a built region was made from, where that is finer than its lattice; else None."""
+    from brmgeo.ingest.imagery import native_gsd_m
+
+    if region.imagery is None:
+        return None
+    plan = plan_maps(region, Store(data / "work"), data / "source" / region.name)
+    step = plan.steps["imagery"]
+    places = {name: i.path if isinstance(i, Step) else Path(i) for name, i in step.inputs.items()}
+    source = step.settings["source"]
+    root = places[source["files"][0]].parent if source["files"] else places["imagery"]
+    box, _ = read_lattice(places["lattice"])
+    text = json.dumps(source)
+    native = native_gsd_m(_imagery_sources(text, str(root)), box)
+    steps = math.floor(region.gsd_m / native + 0.05)
+    return NativeImagery(text, str(root), region.crs, region.gsd_m / steps) if steps > 1 else None
 
 
 @functools.lru_cache(maxsize=4)
