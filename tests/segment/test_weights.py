@@ -12,35 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from small_networks import small_card, small_tensors
 
 from brmgeo.errors import InputError, MissingInputError
-from brmgeo.segment.weights import ModelCard, build_network, load_network, load_weights, save_weights
+from brmgeo.segment.weights import build_network, load_network, load_weights, save_weights
 
 torch = pytest.importorskip("torch")
-
-
-def small_card(**changes: object) -> ModelCard:
-    values = {
-        "settings": {"widths": [8, 16], "norm": "batch", "in_channels": 3},
-        "mean": (0.4, 0.42, 0.39),
-        "std": (0.2, 0.19, 0.21),
-        "threshold": 0.45,
-        "temperature": 1.3,
-        "gsd_min_m": 0.1,
-        "gsd_max_m": 0.5,
-        "gsd_work_m": 0.25,
-        "data": {"regions": ["a", "b"], "Kampala": "OpenAerialMap, CC BY 4.0"},
-        "licence": "Apache-2.0",
-        "metrics": {"IoU": 0.91},
-    }
-    return ModelCard(**{**values, **changes})
-
-
-def small_tensors(widths: tuple[int, ...] = (8, 16), seed: int = 1) -> dict[str, np.ndarray]:
-    from brmgeo.segment.unet import UNet, UNetSettings
-
-    torch.manual_seed(seed)
-    return {k: v.numpy() for k, v in UNet(UNetSettings(widths=widths)).state_dict().items()}
 
 
 @pytest.fixture
