@@ -393,7 +393,11 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
     except InputError:
         raise
     except Exception as error:  # GDAL, pyarrow and geopandas raise many kinds on damaged files
-        reason = " ".join(str(error).split())[:160]
+        reason = " ".join(str(error).split())
+        if "not recognized as being in a supported file format" in reason:
+            reason = "no format that GDAL knows"
+        elif len(reason) > 160:
+            reason = f"{reason[:159]}…"
         raise InputError(
             f"{path.name}: cannot be read as footprints ({reason}): check or fetch the file again"
         ) from error
