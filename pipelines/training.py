@@ -21,7 +21,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from brmgeo.errors import InputError, SettingsError
+from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
 from brmgeo.region import Region, TrainingSettings, load_region
@@ -32,13 +32,16 @@ from brmgeo.segment.shards import (
     VERSION,
     ShardWriter,
     TileInfo,
+    check_label,
     entry_row,
     write_index,
 )
 from brmgeo.segment.tiles import (
     SPLITS,
+    UNKNOWN,
     Splits,
     Tally,
+    cells,
     make_label,
     one_split,
     picture_fault,
@@ -59,6 +62,92 @@ from pipelines.regions import region_named
 COARSE = 8  # the survey looks at imagery in pixels this many times larger
 FINEST = 1.3  # tiles may be this many times finer than their imagery, no more: upsampled pictures teach blur
 SURVEY_TILES = 64
+PAIRS_A_SHARD = 512
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+SMALLEST_PX, LARGEST_PX = 32, 8192
+ARROW = 20.0
+ALIGN_BLOCK_M = 250.0
+ALIGN_SEARCH_M = 10.0
+ALIGN_GSD_M = 0.25  # finer pixels tell no more of outlines drawn to a decimetre or worse
+ALIGN_COARSEST_M = 1.2  # a house of eight pixels has edges, one of four has not
+
+
+# --- alignment: how far the labels lie beside the imagery ---------------------------------------------------------
+
+
+def run_alignment(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
+    """Writes alignment.json: the offset between footprints and imagery in each block, and the region's."""
+    from brmgeo.ingest.imagery import native_gsd_m
+    from brmgeo.segment.alignment import BlockOffset, region_offset
+
+    box, _ = read_lattice(inputs["lattice"])
+    left, bottom, right, top = bounds_of(box)
+    gsd_m = max(ALIGN_GSD_M, native_gsd_m(_sources(inputs, settings), box))
+    places = cells((left, bottom, right, top), ALIGN_BLOCK_M)
+    side = min(places[0][2] - places[0][0], places[0][3] - places[0][1])
+    search_m = min(ALIGN_SEARCH_M, side / 4 - gsd_m)
+    found: list[BlockOffset] = []
+    if gsd_m <= ALIGN_COARSEST_M and search_m > 2 * gsd_m:
+        work = functools.partial(_block_offset, dict(inputs), json.dumps(settings), gsd_m, search_m)
+        found = list(map(work, places))
+    whole = region_offset(found)
+    counts = dict(sorted(Counter(b.status for b in found).items()))
+    facts = {
+        **{name: _plain(value) for name, value in asdict(whole).items()},
+        "by_status": counts,
+        "block_m": round(side, 1),
+        "search_m": round(search_m, 2),
+        "gsd_m": round(gsd_m, 4),
+    }
+    blocks = [
+        {"bounds": [round(v, 3) for v in place]} | {n: _plain(v) for n, v in asdict(block).items()}
+        for place, block in zip(places, found, strict=False)
+    ]
+    text = json.dumps({"region": facts, "blocks": blocks}, indent=1)
+    (out / "alignment.json").write_text(text + "\n", encoding="utf-8")
+    return facts
+
+
+def _plain(value: Any) -> Any:
+    """Numbers to the millimetre, None for what JSON lacks."""
+    return (round(value, 3) if np.isfinite(value) else None) if isinstance(value, float) else value
+
+
+def _block_offset(inputs: Inputs, text: str, gsd_m: float, search_m: float, place: Bounds) -> Any:
+    from brmgeo.ingest.imagery import mosaic_to_lattice
+    from brmgeo.segment.alignment import block_offset
+
+    own = lattice(place, str(read_lattice(inputs["lattice"])[0].crs), gsd_m)
+    rgb, seen = mosaic_to_lattice(_sources(inputs, json.loads(text)), own)
+    return block_offset(rgb, seen, _mask(inputs, own), gsd_m, search_m)
+
+
+@functools.lru_cache(maxsize=2)
+def _offsets(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """(n, 4) x, y, dx, dy of the blocks that tell; the region's (dx, dy), zero where it cannot tell; side of a block."""
+    text = json.loads((folder / "alignment.json").read_text(encoding="utf-8"))
+    told = [
+        ((b["bounds"][0] + b["bounds"][2]) / 2, (b["bounds"][1] + b["bounds"][3]) / 2, b["dx_m"], b["dy_m"])
+        for b in text["blocks"]
+        if b["status"] == "told"
+    ]
+    whole = text["region"]
+    own = (whole["dx_m"], whole["dy_m"]) if whole["status"] == "told" else (0.0, 0.0)
+    return np.array(told, dtype=np.float64).reshape(-1, 4), np.array(own), float(whole["block_m"])
+
+
+def label_offset(folder: Path, bounds: Bounds) -> tuple[float, float]:
+    """(dx, dy) in metres by which the labels of a tile are moved: the median of the blocks about it that tell.
+
+    Where fewer than three of them do, the region's; none where that cannot tell either.
+    """
+    blocks, whole, side = _offsets(folder)
+    if not whole.any():
+        return (0.0, 0.0)  # what the region does not tell, its blocks tell by chance
+    x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    near = blocks[np.abs(blocks[:, :2] - (x, y)).max(axis=1) <= 1.5 * side, 2:]
+    dx, dy = np.median(near, axis=0) if len(near) >= 3 else whole
+    return (float(dx), float(dy))
 
 
 # --- tile-survey: every tile that could be cut ------------------------------------------------------------------
@@ -174,25 +263,29 @@ def _survey_some(inputs: Inputs, text: str, todo: tuple[float, int, list[Window]
         if any(area.intersects(shapely.box(*bounds)) for area in held):
             tile["dropped"] = "held-out ground"
             continue
-        mask = _mask(inputs, own)
+        mask = _mask(inputs, own, settings["align"])
         a = own.affine
         coarse = Affine(a.a * COARSE, 0.0, a.c, 0.0, a.e * COARSE, a.f)
         small = GeoBox((window.height // COARSE, window.width // COARSE), coarse, grid.crs)
         rgb, seen = mosaic_to_lattice(_sources(inputs, settings), small)
+        ground = seen & (mask[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] == 0)
         label = make_label(mask, np.repeat(np.repeat(seen, COARSE, axis=0), COARSE, axis=1))
         built, known = shares(label)
         tile["built"], tile["known"] = round(built, 6), round(known, 6)
         if known < settings["min_known_share"] or known == 0:
             tile["dropped"] = "unknown"
         else:
-            tile["dropped"] = picture_fault(rgb, seen, settings["max_cloud_share"])
+            tile["dropped"] = picture_fault(rgb, seen, ground, settings["max_cloud_share"])
         if tile["dropped"] is None and tile["split"] is None:
             tile["dropped"] = "guard"
     return found
 
 
-def _mask(inputs: Inputs, own: GeoBox) -> NDArray[np.uint8]:
-    """(h, w) uint8 building mask of one tile, drawn at its own GSD from the footprints that touch it."""
+def _mask(inputs: Inputs, own: GeoBox, align: bool = False) -> NDArray[np.uint8]:
+    """(h, w) uint8 building mask of one tile, drawn at its own GSD from the footprints that touch it.
+
+    With ``align`` the map is moved by its offset from the imagery first.
+    """
     from pyogrio.raw import read as read_raw
 
     from brmgeo.maps.rasterize import mask_window
@@ -200,9 +293,13 @@ def _mask(inputs: Inputs, own: GeoBox) -> NDArray[np.uint8]:
     _, known = read_lattice(inputs["lattice"])
     left, bottom, right, top = bounds_of(own)
     reach = own.affine.a
-    touched = (left - reach, bottom - reach, right + reach, top + reach)
+    dx, dy = label_offset(inputs["alignment"], (left, bottom, right, top)) if align else (0.0, 0.0)
+    touched = (left - dx - reach, bottom - dy - reach, right - dx + reach, top - dy + reach)
     wkb = read_raw(inputs["footprints"] / "footprints.gpkg", layer="footprints", columns=[], bbox=touched)[2]
-    return mask_window(shapely.from_wkb(wkb), [p for _, p in known], own)
+    polygons, areas = shapely.from_wkb(wkb), np.array([p for _, p in known], dtype=object)
+    if dx or dy:
+        polygons, areas = (shapely.transform(a, lambda xy: xy + (dx, dy)) for a in (polygons, areas))
+    return mask_window(polygons, areas, own)
 
 
 @functools.lru_cache(maxsize=2)
@@ -234,7 +331,7 @@ def run_tiles(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
                 window = Window(tile["row"], tile["col"], settings["tile_px"], settings["tile_px"])
                 place = window.box_in(grid)
                 rgb, seen = mosaic_to_lattice(_sources(inputs, settings), grid, window)
-                label = make_label(_mask(inputs, place), seen)
+                label = make_label(_mask(inputs, place, settings["align"]), seen)
                 built, known = shares(label)
                 info = TileInfo(
                     tile["key"],
@@ -291,9 +388,11 @@ def run_index(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     facts = dict(settings["facts"])
     if "survey" in inputs:
         facts |= json.loads((inputs["survey"] / "survey.json").read_text(encoding="utf-8"))["facts"]
-    placed = all(row["left"] is not None for row in rows)
-    if placed:
-        _write_gpkg(out / "index.gpkg", rows, settings["credit"])
+    offsets = None
+    if "alignment" in inputs:
+        offsets = json.loads((inputs["alignment"] / "alignment.json").read_text(encoding="utf-8"))
+    if all(row["left"] is not None for row in rows):
+        _write_gpkg(out / "index.gpkg", rows, settings["credit"], offsets["blocks"] if offsets else [])
     statistics = next(split for split in SPLITS if tallies[split].tiles)
     whole = {
         "format": FORMAT,
@@ -311,6 +410,7 @@ def run_index(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         # What a network's input is normalised with; from training tiles wherever there are some.
         "statistics": {"split": statistics} | _colour_told(tallies[statistics]),
         "survey": facts,
+        "alignment": None if offsets is None else {"corrected": settings["align"]} | offsets["region"],
         "blocks": settings["blocks"],
         "sources": settings["sources"],
         "shards": shards,
@@ -344,9 +444,10 @@ def _colour_told(tally: Tally) -> Json:
     return {"mean": [round(v, 6) for v in colour[0]], "std": [round(v, 6) for v in colour[1]]}
 
 
-def _write_gpkg(path: Path, rows: Sequence[Json], credit: str) -> None:
-    """index.gpkg: one polygon a tile, coloured by split when QGIS opens it."""
-    from brmgeo.export.qgis_style import add_default_styles, categorized, fill
+def _write_gpkg(path: Path, rows: Sequence[Json], credit: str, blocks: Sequence[Json]) -> None:
+    """index.gpkg: ``tiles``, one polygon a tile, coloured by split when QGIS opens it, and ``alignment``, the measured
+    offsets as lines ARROW times as long."""
+    from brmgeo.export.qgis_style import Style, add_default_styles, categorized, fill, line, single
     from brmgeo.export.vector import write_layer
 
     colours = {"train": "#2f6bff", "validation": "#ffb02e", "test": "#e0457b"}
@@ -363,9 +464,21 @@ def _write_gpkg(path: Path, rows: Sequence[Json], credit: str) -> None:
     style = categorized(
         "split", [(name, name.capitalize(), [fill(c, 45, c, 0.4)]) for name, c in colours.items()]
     )
-    add_default_styles(path, {"tiles": ([style], "Polygon")})
+    styles: dict[str, tuple[Style, str]] = {"tiles": ([style], "Polygon")}
+    told = [b for b in blocks if b["status"] == "told"]
+    if told:
+        numbers = np.array([[*b["bounds"], b["dx_m"], b["dy_m"]] for b in told], dtype=np.float64)
+        middle = (numbers[:, :2] + numbers[:, 2:4]) / 2
+        arrows = shapely.linestrings(np.stack([middle, middle + ARROW * numbers[:, 4:]], axis=1))
+        values = {
+            name: np.array([b[name] for b in told], dtype=np.float64) for name in ("dx_m", "dy_m", "quality")
+        }
+        write_layer(path, "alignment", arrows, "LineString", rows[0]["crs"], values)
+        styles["alignment"] = ([single(line("#10141c", 1.1), line("#35e0c8", 0.6))], "Line")
+    add_default_styles(path, styles)
 
 
+ALIGNMENT = Stage("alignment", 1, run_alignment)
 SURVEY = Stage("tile-survey", 1, run_survey)
 TILES = Stage("tiles", 1, run_tiles)
 INDEX = Stage("tile-index", 1, run_index)
@@ -374,8 +487,12 @@ INDEX = Stage("tile-index", 1, run_index)
 # --- the plan -----------------------------------------------------------------------------------------------------
 
 
-def plan_tiles(region: Region, store: Store, data: Path, fetch: bool = False) -> tuple[Plan, dict[str, str]]:
+def plan_tiles(
+    region: Region, store: Store, data: Path, fetch: bool = False, align: bool = False
+) -> tuple[Plan, dict[str, str]]:
     """The steps of a region's training tiles, and the label of each shard's step -> the shard's name.
+
+    With ``align`` the labels are moved by their measured offset; measured and told it is in any case.
 
     Raises SettingsError for a region without imagery, and as ``plan_maps``.
     """
@@ -396,11 +513,11 @@ def plan_tiles(region: Region, store: Store, data: Path, fetch: bool = False) ->
         "footprints": plan.steps["footprints"],
     }
     box = lattice(maps._place(region), region.crs, region.gsd_m)
-    cut = {
-        "region": region.name,
-        "source": imagery.settings["source"],
-        "tile_px": own.tile_px,
-    }
+    source = imagery.settings["source"]
+    alignment = plan.add(ALIGNMENT, inputs, {"source": source})
+    if align:
+        inputs["alignment"] = alignment
+    cut = {"region": region.name, "source": source, "tile_px": own.tile_px, "align": align}
     rules = own.model_dump(
         include={
             "overlap_px", "gsd_m", "empty_share", "split", "block_m", "guard_m", "validation_share", "test_share", "seed",
@@ -435,7 +552,8 @@ def plan_tiles(region: Region, store: Store, data: Path, fetch: bool = False) ->
     blocks = _splits(json.loads(json.dumps(rules | {"bounds": bounds_of(box)})))
     plan.add(
         INDEX,
-        {"survey": survey} | {name: plan.steps[label] for label, name in names.items()},
+        {"survey": survey, "alignment": alignment}
+        | {name: plan.steps[label] for label, name in names.items()},
         {
             "region": region.name,
             "title": region.title,
@@ -444,6 +562,7 @@ def plan_tiles(region: Region, store: Store, data: Path, fetch: bool = False) ->
             "overlap_px": own.overlap_px,
             "shards": list(names.values()),
             "facts": {},
+            "align": align,
             "blocks": {
                 "guard_m": blocks.guard_m,
                 "blocks": [[name, *blocks.block(i)] for i, name in enumerate(blocks.names)],
@@ -553,7 +672,7 @@ def cut_region(
         changes["gsd_m"] = tuple(gsd_m)
     if changes:
         region = region.model_copy(update={"training": _changed(region.training, changes)})
-    return cut_tiles(region, data, out or data / "out" / region.name / "tiles", scheduler_spec)
+    return cut_tiles(region, data, out or data / "out" / region.name / "tiles", scheduler_spec, align)
 
 
 def _changed(settings: TrainingSettings, changes: Mapping[str, Any]) -> TrainingSettings:
@@ -567,13 +686,13 @@ def _changed(settings: TrainingSettings, changes: Mapping[str, Any]) -> Training
         raise SettingsError(f"tiles: {describe_fault(error, TrainingSettings)}") from None
 
 
-def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None) -> Path:
+def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None, align: bool = False) -> Path:
     """Builds what is missing of a region's training tiles and publishes them in ``out``."""
     progress = Progress()
     maps._require_writable(out)
     store = Store(data / "work")
     with store.lock(region.name):
-        plan, names = plan_tiles(region, store, data, fetch=True)
+        plan, names = plan_tiles(region, store, data, fetch=True, align=align)
         with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
             made = plan.build(map, progress)
         _publish(made, names, out)
@@ -584,6 +703,19 @@ def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None)
         progress.say(
             f"{region.name}: nothing cut at {maps._listed([f'{g:g} m' for g in survey['gsd_too_fine_m']])}: much finer than "
             f"the imagery's {survey['imagery_gsd_m']:g} m per pixel"
+        )
+    offset = made["alignment"].facts
+    if offset["status"] == "told":
+        moved = "the labels were moved by it" if align else "--align moves the labels by it"
+        progress.say(
+            f"{region.name}: labels lie {np.hypot(offset['dx_m'], offset['dy_m']):.2f} m beside the imagery (move them by "
+            f"{offset['dx_m']:+.2f} m east, {offset['dy_m']:+.2f} m north; {offset['told']} of {offset['blocks']} blocks "
+            f"tell); {moved}"
+        )
+    else:
+        progress.say(
+            f"{region.name}: how far the labels lie beside the imagery cannot be told ({offset['told']} of "
+            f"{offset['blocks']} blocks tell)" + ("; they stay where they are" if align else "")
         )
     progress.say(
         f"{region.name}: {facts['tiles']} tiles ({told}) in {facts['shards']} shards; results are in {out}"
@@ -599,6 +731,179 @@ def _publish(made: Mapping[str, Artifact], names: Mapping[str, str], out: Path) 
             wanted.add(f"{name}.tar")
     index = made["tile-index"]
     publish(index, out, sorted(index.record["outputs"]))
+    if "alignment" in made:
+        publish(made["alignment"], out, ["alignment.json"])
     for stale in out.glob("*.tar"):
         if stale.name not in wanted:
             stale.unlink()
+
+
+# --- pairs: images and masks of others ------------------------------------------------------------------------------
+
+
+def run_pairs(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
+    """Writes shard.tar and entries.json of some image + mask pairs, as they are."""
+    tallies = {split: Tally() for split in SPLITS}
+    dropped: Counter[str] = Counter()
+    with ShardWriter(out / "shard.tar", image_format="png") as shard:
+        for key, image_name, mask_name in settings["pairs"]:
+            image, seen = _read_image(inputs["images"] / image_name)
+            label = check_label(_read_mask(inputs["masks"] / mask_name), mask_name)
+            if label.shape != seen.shape:
+                raise InputError(
+                    f"{inputs['masks'] / mask_name}: {label.shape[1]} x {label.shape[0]} px, its image {image_name} has "
+                    f"{seen.shape[1]} x {seen.shape[0]}; give masks of their images' sizes"
+                )
+            label[~seen] = UNKNOWN
+            built, known = shares(label)
+            fault = "unknown" if known == 0 else picture_fault(image, label != UNKNOWN)
+            if fault is not None:
+                dropped[fault] += 1
+                continue
+            place = (float("nan"),) * 4
+            info = TileInfo(
+                key,
+                0,
+                settings["gsd_m"],
+                settings["split"],
+                settings["region"],
+                round(built, 6),
+                round(known, 6),
+                (place[0], place[1], place[2], place[3]),
+                "",
+            )
+            shard.add(info, image, label)
+            tallies[settings["split"]].add(image, label)
+    _write_entries(out, [entry_row(entry) for entry in shard.entries], tallies)
+    return {"tiles": len(shard.entries), "dropped": dict(sorted(dropped.items()))}
+
+
+def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """(h, w, 3) uint8 RGB and (h, w) bool, False where it is transparent; InputError for what is no 8-bit picture."""
+    found = _decoded(path)
+    if found.ndim == 2:
+        found = np.repeat(found[..., None], 3, axis=2)
+    if found.shape[-1] not in (3, 4):
+        raise InputError(f"{path}: has {found.shape[-1]} bands; give grey, RGB or RGBA pictures")
+    seen = found[..., 3] >= 128 if found.shape[-1] == 4 else np.ones(found.shape[:2], np.bool_)
+    rgb = np.ascontiguousarray(found[..., 2::-1])
+    rgb[~seen] = 0
+    return rgb, seen
+
+
+def _read_mask(path: Path) -> NDArray[np.uint8]:
+    return _decoded(path)
+
+
+def _decoded(path: Path) -> NDArray[np.uint8]:
+    """A picture as OpenCV reads it, with all its bands."""
+    import cv2
+
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if found is None:
+        raise InputError(
+            f"{path}: is not a readable picture; fetch or export it again, or take it out with its partner"
+        )
+    if found.dtype != np.uint8:
+        raise InputError(f"{path}: holds {found.dtype} values; give pictures of 8 bit")
+    if min(found.shape[:2]) < SMALLEST_PX or max(found.shape[:2]) > LARGEST_PX:
+        raise InputError(
+            f"{path}: {found.shape[1]} x {found.shape[0]} px; training tiles have {SMALLEST_PX} to {LARGEST_PX} px a side: "
+            "cut or leave out the picture"
+        )
+    return np.asarray(found, dtype=np.uint8)
+
+
+PAIRS = Stage("tile-pairs", 1, run_pairs)
+
+
+def cut_pairs(
+    images: Path,
+    masks: Path,
+    out: Path,
+    gsd_m: float,
+    name: str,
+    split: str,
+    attribution: str,
+    terms: str,
+    scheduler_spec: str | None,
+) -> Path:
+    """Makes training tiles of pictures and the masks of the same names; the folder that they are in.
+
+    Raises MissingInputError for folders without pictures and pictures without a mask, InputError for damaged ones.
+    """
+    if not 0.02 <= gsd_m <= 10:
+        raise SettingsError(f"tiles --pairs: --gsd {gsd_m:g} is no size of a pixel in metres (0.02 to 10)")
+    safe = maps._safe_name(name)
+    pairs = _paired(images, masks)
+    progress = Progress()
+    maps._require_writable(out)
+    store = Store(out / ".brmgeo")
+    with store.lock(safe):
+        plan = Plan(store, safe)
+        names: dict[str, str] = {}
+        inputs: dict[str, Input] = {"images": images, "masks": masks}
+        for number, first in enumerate(range(0, len(pairs), PAIRS_A_SHARD)):
+            shard = f"{safe}-{number:03d}"
+            some = [(f"{safe}-{stem}", *files) for stem, *files in pairs[first : first + PAIRS_A_SHARD]]
+            plan.add(
+                PAIRS,
+                inputs,
+                {"pairs": some, "gsd_m": gsd_m, "split": split, "region": safe},
+                f"tiles {shard}",
+            )
+            names[f"tiles {shard}"] = shard
+        plan.add(
+            INDEX,
+            {shard: plan.steps[label] for label, shard in names.items()},
+            {
+                "region": safe,
+                "title": name,
+                "hold_out": split == "test",
+                "tile_px": None,
+                "overlap_px": 0,
+                "shards": list(names.values()),
+                "facts": {"candidates": len(pairs)},
+                "align": False,
+                "blocks": None,
+                "credit": attribution,
+                "sources": [{"what": "imagery and masks", "attribution": attribution, "terms": terms}],
+            },
+        )
+        with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
+            made = plan.build(map, progress)
+        _publish(made, names, out)
+    left = len(pairs) - made["tile-index"].facts["tiles"]
+    progress.say(
+        f"{safe}: {len(pairs) - left} tiles ({split}), {left} left out as blank, cloudy or unknown; results are in {out}"
+    )
+    return out
+
+
+def _paired(images: Path, masks: Path) -> list[tuple[str, str, str]]:
+    """(key, image's name, mask's name) of all pairs, by name."""
+    found = []
+    for folder in (images, masks):
+        if not folder.is_dir():
+            raise MissingInputError(
+                f"tiles --pairs: {folder} is not a folder; give a folder of images and one of masks"
+            )
+        files = [
+            p for p in sorted(folder.iterdir()) if p.suffix.lower() in PICTURES and not p.name.startswith(".")
+        ]
+        found.append({p.stem: p.name for p in files})
+    pictures, labels = found
+    if not pictures:
+        raise MissingInputError(f"tiles --pairs: {images} holds no picture ({', '.join(PICTURES)})")
+    lonely = sorted(pictures.keys() ^ labels.keys())
+    if lonely:
+        where = masks if lonely[0] in pictures else images
+        raise MissingInputError(
+            f"tiles --pairs: {len(lonely)} pictures have no partner, such as {lonely[0]}, which {where} lacks; "
+            "images and masks have the same names"
+        )
+    return [(maps._safe_name(stem), name, labels[stem]) for stem, name in sorted(pictures.items())]

@@ -3,8 +3,8 @@
 A folder of tiles holds
 
 - ``*.tar``: uncompressed shards. Each tile is three files: ``KEY.jpg`` or ``KEY.png`` (RGB), ``KEY.label.png`` (8 bit:
-  0 other, 255 building, 127 unknown) and ``KEY.json`` (what the index says of it). ``tar xf`` unpacks them; loaders of the WebDataset
-  kind read them as they are.
+  0 other, 255 building, 127 unknown) and ``KEY.json`` (what the index says of it). ``tar xf`` unpacks them; loaders of the
+  WebDataset kind read them as they are.
 - ``index.csv``: one row a tile with its place, split and shares, and the byte offset, size and CRC-32 of its image and label
   within its shard, for reading any tile without reading the others.
 - ``tiles.json``: counts, statistics, attribution, the shards with their sizes, format and version.

@@ -51,6 +51,14 @@ def rank(name: str, seed: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}\n{name}".encode()).digest()[:8], "big")
 
 
+def cells(bounds: Bounds, side_m: float) -> list[Bounds]:
+    """``bounds`` divided evenly into rectangles of about ``side_m`` a side, row by row from the north."""
+    left, bottom, right, top = bounds
+    rows, cols = max(1, round((top - bottom) / side_m)), max(1, round((right - left) / side_m))
+    whole = Splits(bounds, rows, cols, (), 0.0)
+    return [whole.block(i) for i in range(rows * cols)]
+
+
 @dataclass(frozen=True, slots=True)
 class Splits:
     """Ground divided into rectangular blocks, each for one split.
@@ -138,16 +146,22 @@ def shares(label: NDArray[np.uint8]) -> tuple[float, float]:
     return (built / known if known else 0.0, known / label.size)
 
 
-def picture_fault(rgb: NDArray[np.uint8], seen: NDArray[np.bool_], cloud_share: float = 0.5) -> str | None:
+def picture_fault(
+    rgb: NDArray[np.uint8],
+    seen: NDArray[np.bool_],
+    ground: NDArray[np.bool_] | None = None,
+    cloud_share: float = 0.5,
+) -> str | None:
     """Why a picture teaches nothing: ``blank``, ``cloudy``, or None.
 
     Args:
         rgb: (h, w, 3) uint8, best a small version of the tile (1/8): clouds are large.
         seen: (h, w) bool, its known pixels.
-        cloud_share: share of the known pixels that may be cloud.
+        ground: (h, w) bool, known pixels without building, which are searched for cloud; without it none is looked for.
+        cloud_share: share of the ground that may be cloud.
 
-    Blank is a picture of one colour, as services send where they have none. Cloud is bright, without colour and smooth
-    over its surroundings: white roofs and concrete are bright too, but edged.
+    Blank is a picture of one colour, as services send where they have none. Cloud is bright, without colour and smooth,
+    which a large white roof is too: so only ground between buildings is judged.
     """
     if not seen.any():
         return "blank"
@@ -155,10 +169,12 @@ def picture_fault(rgb: NDArray[np.uint8], seen: NDArray[np.bool_], cloud_share: 
     grey = values.mean(axis=-1)
     if float(values[seen].std(axis=0).max()) < _BLANK_STD:
         return "blank"
+    if ground is None or not ground.any():
+        return None
     high, low = rgb.max(axis=-1).astype(np.int16), rgb.min(axis=-1).astype(np.int16)
     rough = np.sqrt(np.maximum(_mean3(grey * grey) - _mean3(grey) ** 2, 0))
-    cloud = (low >= _CLOUD_BRIGHT) & (high - low <= _CLOUD_COLOUR) & (rough <= _CLOUD_ROUGH) & seen
-    return "cloudy" if cloud.sum() > cloud_share * seen.sum() else None
+    cloud = (low >= _CLOUD_BRIGHT) & (high - low <= _CLOUD_COLOUR) & (rough <= _CLOUD_ROUGH) & ground
+    return "cloudy" if cloud.sum() > cloud_share * ground.sum() else None
 
 
 def _mean3(values: NDArray[np.float32]) -> NDArray[np.float32]:
