@@ -25,6 +25,7 @@ from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
 from brmgeo.region import Region, TrainingSettings, load_region
+from brmgeo.segment import SPLITS, UNKNOWN
 from brmgeo.segment.shards import (
     FORMAT,
     INDEX_CSV,
@@ -37,8 +38,6 @@ from brmgeo.segment.shards import (
     write_index,
 )
 from brmgeo.segment.tiles import (
-    SPLITS,
-    UNKNOWN,
     Splits,
     Tally,
     cells,

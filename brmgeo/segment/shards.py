@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError
-from brmgeo.segment.tiles import BUILDING, OTHER, SPLITS, UNKNOWN
+from brmgeo.segment import BUILDING, OTHER, SPLITS, UNKNOWN
 
 FORMAT, VERSION = "brmgeo-tiles", 1
 TILES_JSON, INDEX_CSV = "tiles.json", "index.csv"

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.geo.grid import Bounds, Window
+from brmgeo.segment import BUILDING as BUILDING
+from brmgeo.segment import OTHER
+from brmgeo.segment import UNKNOWN as UNKNOWN
 
-OTHER, BUILDING, UNKNOWN = 0, 255, 127
-SPLITS = ("train", "validation", "test")
-
-_OUTSIDE_THE_MAP = 255  # of brmgeo.maps.rasterize.mask_window
 _BLANK_STD = 2.0  # grey levels: flat water keeps more than this at any GSD, a placeholder picture less
 _CLOUD_BRIGHT = 190
 _CLOUD_COLOUR = 28
