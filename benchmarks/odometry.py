@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from brmgeo.flight.camera import ray_from_pixel
+from brmgeo.flight.motion import MIN_STEP_NOISE_M
 from brmgeo.flight.readings import Attitude, Camera, Imu
 from brmgeo.flight.vio import VioResult, VioSettings, run_vio
 from brmgeo.synth.flight import Course, FlightSettings, Imagery, Simulator, fly, imu_of, rectangle
@@ -72,6 +73,7 @@ CONDITIONS = [
     Condition("delay 50 ms", "camera late against the IMU", delay_s=0.05),
     Condition("delay not estimated", "the same, held at zero", delay_s=0.05, vio={"delay_sigma_s": 0.0}),
     Condition("boresight 1 deg", "in roll and pitch", boresight_deg=(1.0, 1.0, 0.0)),
+    Condition("boresight yaw 2 deg", "camera turned in its mount", boresight_deg=(0.0, 0.0, 2.0)),
     Condition(
         "boresight not estimated", "the same, held at zero", boresight_deg=(1.0, 1.0, 0.0), vio={"boresight_sigma_rad": 0.0}
     ),
@@ -290,21 +292,26 @@ def score(result: VioResult, truth: Any, yaw: Any, seconds: float) -> dict[str, 
     flown = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     # Steps of five seconds, as the matcher takes them, against what the filter says of them; scale and heading taken out.
     stride = max(1, round(5.0 / float(np.median(np.diff(result.odometry.t_s)))))
-    a, b = xy[stride::stride] - xy[:-stride:stride], truth[stride::stride, :2] - truth[:-stride:stride, :2]
+    a, b = (p[stride::stride] - p[:-stride:stride] for p in (xy, truth[:, :2]))
     m = min(len(a), len(b))
     za, zb = a[:m] @ [1, 1j], b[:m] @ [1, 1j]
     fit = np.vdot(za, zb) / np.vdot(za, za)
-    sigma = np.sqrt(np.maximum(np.diff(result.walk_m2[::stride])[:m], 1e-9))
+    # As motions() hands it to the matchers: not better than 2 cm.
+    sigma = np.sqrt(np.maximum(np.diff(result.walk_m2[::stride])[:m], MIN_STEP_NOISE_M**2))
+    miss = np.abs(za * fit - zb)
     return {
         "rmse": float(np.sqrt((error**2).mean())),
         "end": float(error[-1]),
         "heading": float(np.sqrt((heading**2).mean())),
         "scale": float(flown.sum() / steps.sum() - 1.0),
-        "step_error": float(np.sqrt((np.abs(za * fit - zb) ** 2).mean() / 2)),
+        "step_error": float(np.sqrt((miss**2).mean() / 2)),
         "step_sigma": float(np.sqrt((sigma**2).mean())),
+        "step_nees": float((miss**2 / sigma**2).mean() / 2),
         "delay_ms": 1000.0 * result.delay_s,
         "boresight_roll": math.degrees(result.boresight_rad[0]),
         "boresight_pitch": math.degrees(result.boresight_rad[1]),
+        "boresight_yaw": math.degrees(result.boresight_rad[2]),
+        "boresight_yaw_sigma": math.degrees(result.boresight_sigma_rad[2]),
         "blind": float(result.blind.mean()),
         "high": result.high_share,
         "tracks": float(result.tracks.mean()),
@@ -350,21 +357,20 @@ def main() -> None:
         for line in given.results.read_text(encoding="utf-8").splitlines():
             row = json.loads(line)
             done[row.pop("condition"), row.pop("seed")] = row
-    lines = []
-    for condition in CONDITIONS:
-        if given.names and condition.name not in given.names:
-            continue
-        rows = []
-        for seed in range(given.first, given.first + given.seeds):
-            known = done.get((condition.name, seed))
-            if known is None and given.done_only:
+    chosen = [c for c in CONDITIONS if not given.names or c.name in given.names]
+    # All conditions once, then all of them again: what is stopped early still has every row.
+    for seed in range(given.first, given.first + given.seeds):
+        for condition in chosen:
+            if (condition.name, seed) in done or given.done_only:
                 continue
-            row = known or fly_once(condition, seed, imagery, ground)
-            rows.append(row)
-            if given.results is not None and (condition.name, seed) not in done:
+            row = done[condition.name, seed] = fly_once(condition, seed, imagery, ground)
+            if given.results is not None:
                 with given.results.open("a", encoding="utf-8") as out:
                     out.write(json.dumps({"condition": condition.name, "seed": seed} | row) + "\n")
-            print(condition.name, seed, {k: round(v, 3) for k, v in rows[-1].items()}, flush=True)
+            print(condition.name, seed, {k: round(v, 3) for k, v in row.items()}, flush=True)
+    lines = []
+    for condition in chosen:
+        rows = [done[condition.name, s] for s in range(1, 100) if (condition.name, s) in done]
         if rows:
             lines.append(table_row(condition, rows))
             print(lines[-1], flush=True)
@@ -380,14 +386,16 @@ def table_row(condition: Condition, rows: list[dict[str, float]]) -> str:
     return (
         f"| {condition.name} | {condition.says} | {len(rows)} | {np.mean(rmse):.2f} ({rmse.min():.2f}-{rmse.max():.2f}) | "
         f"{of('end').mean():.2f} | {of('heading').mean():.2f} | {100 * np.abs(of('scale')).mean():.2f} | "
-        f"{of('step_error').mean():.2f} / {of('step_sigma').mean():.2f} | {of('delay_ms').mean():.1f} | "
-        f"{of('boresight_roll').mean():+.2f}, {of('boresight_pitch').mean():+.2f} | {of('fps').mean():.0f} |"
+        f"{of('step_error').mean():.2f} / {of('step_sigma').mean():.2f} | "
+        f"{of('step_nees').mean():.1f} | {of('delay_ms').mean():.1f} | "
+        f"{of('boresight_roll').mean():+.2f}, {of('boresight_pitch').mean():+.2f}, {of('boresight_yaw').mean():+.2f} | "
+        f"{of('fps').mean():.0f} |"
     )
 
 
 HEAD = (
-    "| condition | | seeds | RMSE m (range) | end m | heading deg | scale % | 5 s step m: error / sigma | delay ms | "
-    "boresight deg | frames/s |\n|---|---|---|---|---|---|---|---|---|---|---|"
+    "| condition | | seeds | RMSE m (range) | end m | heading deg | scale % | 5 s step m: error / sigma | squared | "
+    "delay ms | boresight deg | frames/s |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 

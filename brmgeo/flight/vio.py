@@ -17,8 +17,9 @@ Bloesch et al., "Fusion of optical flow and inertial measurements for robust ego
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numba as nb
@@ -31,6 +32,9 @@ from brmgeo.flight.klt import KltSettings, KltTracker
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu, Odometry
 
 GRAVITY = 9.80665
+WARM_BYTES = 256_000_000
+# Share of the height over which the ground's unevenness pulls steps the same way; by the errors of simulated flights.
+RELIEF_LENGTH = 0.18
 # Error state: where each part begins. The clone (position, attitude) is last.
 P, V, TH, BG, BA, TD, BS, CP, CT, SIZE = 0, 3, 6, 9, 12, 15, 16, 19, 22, 25
 # What a picture sees of it: all but velocity and the biases.
@@ -56,6 +60,8 @@ class VioSettings:
         min_tracks: with fewer points common with the keyframe a frame is blind.
         layer_m: points higher than this above the ground layer (and two sigma) are left out.
         max_gap_s: after a longer pause between frames nothing is tracked across.
+        warm_s: so many seconds at the beginning are gone through twice, so that speed, tilt, biases and boresight are
+            known when points are first seen (at most ``WARM_BYTES`` of frames); 0: once.
         lost_m: a blind stretch that leaves the place less sure than this begins a new segment.
     """
 
@@ -78,6 +84,7 @@ class VioSettings:
     min_tracks: int = 15
     layer_m: float = 2.0
     max_gap_s: float = 1.5
+    warm_s: float = 20.0
     lost_m: float = 15.0
     klt: KltSettings = field(default_factory=KltSettings)
 
@@ -352,7 +359,7 @@ class VioFilter:
     def __init__(
         self, camera: Camera, mount: Attitude, imu: Imu, settings: VioSettings | None = None
     ) -> None:
-        self.camera, self.imu = camera, imu
+        self.camera, self.mount, self.imu = camera, mount, imu
         self.settings = s = settings or VioSettings()
         self.focal = 0.5 * (camera.fx + camera.fy)
         self.tracker = KltTracker(s.klt)
@@ -362,7 +369,9 @@ class VioFilter:
         self.bore: FloatArray = np.eye(3)
         self.gyro_bias, self.accel_bias = np.zeros(3), np.zeros(3)
         self.omega = np.zeros(3)
-        self.walk = 0.0
+        self.relief_walk = 0.0
+        self.keyframes = 0
+        self._relief_place = np.zeros(3)
         self._walk_key = 0.0
         self.segment = 0
         self._sure_walk = 0.0
@@ -371,9 +380,14 @@ class VioFilter:
         self._last_t = -math.inf
         self._started = False
         self._anchor: tuple[FloatArray, FloatArray] | None = None
+        self.cov: FloatArray = np.zeros((SIZE, SIZE))
 
-    def start(self, t_s: float, agl_m: float) -> None:
-        """Level by the accelerometer's mean over half a second about ``t_s``; height from the altimeter."""
+    def start(self, t_s: float, agl_m: float, warm: VioFilter | None = None) -> None:
+        """Level by the accelerometer's mean over half a second about ``t_s``; height from the altimeter.
+
+        ``warm`` is a filter that has gone through the first seconds already: what it learnt is taken from it, and its
+        attitude and velocity are followed back to the start through the IMU.
+        """
         s = self.settings
         near = np.abs(self.imu.t_s - t_s) <= 0.5
         if not near.any():
@@ -392,6 +406,21 @@ class VioFilter:
         sigma[TH : TH + 2] = s.tilt_sigma_rad
         sigma[BG : BG + 3], sigma[BA : BA + 3] = s.gyro_bias_sigma, s.accel_bias_sigma
         sigma[TD], sigma[BS : BS + 3] = s.delay_sigma_s, s.boresight_sigma_rad
+        if warm is not None:
+            self.delay, self.bore = warm.delay, warm.bore
+            self.gyro_bias, self.accel_bias = warm.gyro_bias, warm.accel_bias
+            self.t = t_s + self.delay
+            zero = np.zeros(3)
+            first = warm.rot @ self._through_imu(zero, zero, np.eye(3), self.t, warm.t)[2].T
+            speed = warm.v - self._through_imu(zero, zero, first, self.t, warm.t)[1]
+            turn = Attitude(0.0, 0.0, -math.atan2(first[1, 0], first[0, 0])).matrix()
+            self.rot, self.v = turn @ first, turn @ speed
+            # Twice as unsure as it is, and by what the way back may have cost: the same frames are used again.
+            more = np.zeros(SIZE)
+            more[V : V + 3], more[TH : TH + 2] = 1.0, math.radians(0.1)
+            more[TD], more[BS : BS + 3] = 0.002, math.radians(0.05)
+            learnt = 2.0 * np.sqrt(np.maximum(np.diag(warm.cov), 0.0)) + more
+            sigma[V:CP] = np.minimum(sigma, learnt)[V:CP]
         self.cov = np.diag(sigma**2)
         self._started = True
         self._clone()
@@ -456,6 +485,7 @@ class VioFilter:
     def _clone(self) -> None:
         if hasattr(self, "pk"):
             self._walk_key = self.step_variance()
+        self.keyframes += 1
         self.pk, self.rk = self.p.copy(), self.rot.copy()
         select = np.zeros((SIZE, SIZE))
         select[:CP, :CP] = np.eye(CP)
@@ -466,27 +496,18 @@ class VioFilter:
         select[CT : CT + 3, TD] = self.rot @ self.omega
         self.cov = select @ self.cov @ select.T
 
+    def _through_imu(self, p: FloatArray, v: FloatArray, rot: FloatArray, t0: float, t1: float) -> Any:
+        s, imu = self.settings, self.imu
+        noises = (s.gyro_noise, s.accel_noise, s.gyro_walk, s.accel_walk, s.ground_walk_m_sqrt_s)
+        readings = (imu.t_s, imu.gyro_rad_s, imu.accel_m_s2)
+        biases = (self.gyro_bias, self.accel_bias)
+        return _propagate(p, v, rot, *biases, t0, t1, *readings, *(n**2 for n in noises))
+
     def _advance(self, t: float) -> None:
-        s = self.settings
         if t <= self.t:
             return
-        imu = self.imu
-        self.p, self.v, self.rot, phi, noise, self.omega = _propagate(
-            self.p,
-            self.v,
-            self.rot,
-            self.gyro_bias,
-            self.accel_bias,
-            self.t,
-            t,
-            imu.t_s,
-            imu.gyro_rad_s,
-            imu.accel_m_s2,
-            s.gyro_noise**2,
-            s.accel_noise**2,
-            s.gyro_walk**2,
-            s.accel_walk**2,
-            s.ground_walk_m_sqrt_s**2,
+        self.p, self.v, self.rot, phi, noise, self.omega = self._through_imu(
+            self.p, self.v, self.rot, self.t, t
         )
         c = self.cov
         top = phi @ c[:15, 15:]
@@ -585,9 +606,14 @@ class VioFilter:
         ground = usable & ~self._high()
         if ground.sum() >= s.min_tracks:
             usable = ground
+        # A point that has not moved far yet may be a roof as well.
+        sure = ground & (pts.sigma < 2.0 * s.layer_m)
+        if self._layer is not None and sure.sum() >= 2 * s.min_tracks:
+            usable = sure
         chosen = np.flatnonzero(usable).astype(np.int64)
         if len(chosen) < s.min_tracks:
             return 0
+        self._note_relief(chosen)
         key, seen = np.ascontiguousarray(pts.key_ray[chosen]), np.ascontiguousarray(rays[chosen, :2])
         base = self._weights(chosen)
         weight = np.zeros(len(chosen))
@@ -612,6 +638,18 @@ class VioFilter:
             posterior = (gain + gain.T) / 2.0
         self.cov = posterior
         return int(inliers)
+
+    def _note_relief(self, chosen: NDArray[np.int64]) -> None:
+        # What is taken for ground lies at several heights, more than these err: low roofs are among it, and their mean
+        # is not the ground's. That lengthens steps, alike over RELIEF_LENGTH of the height and then anew.
+        height, sigma = self.points.height[chosen], self.points.sigma[chosen]
+        known = sigma < 3.0
+        relief = 0.0
+        if known.sum() >= 8:
+            relief = max(0.0, float(height[known].var()) - float(np.median(sigma[known])) ** 2)
+        moved = math.hypot(*(self.p - self._relief_place)[:2])
+        self.relief_walk += RELIEF_LENGTH * relief * moved / max(float(self.p[2]), 1.0)
+        self._relief_place = self.p.copy()
 
     def _state(self) -> tuple[Any, ...]:
         # All that _correct changes, in its order; it makes new arrays and leaves these as they are.
@@ -677,9 +715,11 @@ def run_vio(
         raise ValueError(f"{len(times)} frames and {len(imu.t_s)} IMU readings: two of each are needed")
     imu = Imu(*(np.ascontiguousarray(a, dtype=np.float64) for a in (imu.t_s, imu.gyro_rad_s, imu.accel_m_s2)))
     vio = VioFilter(camera, mount, imu, settings)
+    images = _warmed(vio, times, iter(images), np.asarray(agl_m, dtype=np.float64))
     n = len(times)
     xyz, turned, velocity = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3))
-    walk, yaw_sigma = np.empty(n), np.empty(n)
+    walk, relief, yaw_sigma = np.empty(n), np.empty(n), np.empty(n)
+    key = np.zeros(n, dtype=np.int64)
     tracks, blind = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.bool_)
     segment = np.zeros(n, dtype=np.int64)
     high = 0.0
@@ -687,13 +727,14 @@ def run_vio(
         tracks[i], blind[i] = vio.frame(float(times[i]), grey, float(agl_m[i]))
         xyz[i], velocity[i], segment[i] = vio.p, vio.v, vio.segment
         turned[i] = vio.rot
-        walk[i], yaw_sigma[i] = vio.step_variance(), math.sqrt(max(0.0, float(vio.cov[TH + 2, TH + 2])))
+        walk[i], relief[i], key[i] = vio.step_variance(), vio.relief_walk, vio.keyframes
+        yaw_sigma[i] = math.sqrt(max(0.0, float(vio.cov[TH + 2, TH + 2])))
         high += float(vio._high().mean()) if len(vio.points.sigma) else 0.0
     sigma = np.sqrt(np.maximum(np.diag(vio.cov), 0.0))
     wxyz = Rotation.from_matrix(turned).as_quat()[:, [3, 0, 1, 2]]
     return VioResult(
         Odometry(times, xyz, wxyz, "embedded visual-inertial odometry", segment),
-        np.maximum.accumulate(walk),
+        _even(times, walk, key, blind) + relief,
         yaw_sigma,
         tracks,
         blind,
@@ -706,3 +747,41 @@ def run_vio(
         vio.accel_bias,
         high / n,
     )
+
+
+def _even(
+    times: FloatArray, walk: FloatArray, key: NDArray[np.int64], blind: NDArray[np.bool_]
+) -> FloatArray:
+    # Within a keyframe the variance against it is no sum of steps: it rises at once and then falls with every new frame.
+    # Each step bears its share of the whole, but what a blind stretch cost stays there.
+    knot = np.diff(key, prepend=-1) != 0
+    knot[-1] = True
+    knot |= blind
+    knot[:-1] |= blind[1:]
+    at = np.flatnonzero(knot)
+    return np.asarray(np.interp(times, times[at], np.maximum.accumulate(walk[at])))
+
+
+def _warmed(
+    vio: VioFilter, times: FloatArray, images: Iterator[NDArray[np.uint8]], agl_m: FloatArray
+) -> Iterator[NDArray[np.uint8]]:
+    # Starts ``vio`` with what a first filter makes of the first seconds; all the images, those first ones again.
+    first: list[NDArray[np.uint8]] = []
+    held = 0
+    warm = VioFilter(vio.camera, vio.mount, vio.imu, vio.settings)
+    good = 0
+    for i in range(int(np.searchsorted(times, times[0] + vio.settings.warm_s))):
+        grey = next(images, None)
+        if grey is None:
+            break
+        first.append(grey)
+        held += grey.nbytes
+        _, blind = warm.frame(float(times[i]), grey, float(agl_m[i]))
+        good += not blind
+        if held > WARM_BYTES:
+            break
+    n = len(first)
+    # A short or a blind beginning teaches nothing.
+    if n > 1 and times[n - 1] - times[0] >= 0.25 * vio.settings.warm_s and good >= 0.9 * n and not blind:
+        vio.start(float(times[0]), float(agl_m[0]), warm)
+    return chain(first, images)
