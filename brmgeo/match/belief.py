@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numba as nb
@@ -170,6 +171,28 @@ def _step_kernels(fraction: F64, sigma: float, reach: int) -> F32:
     edges = (np.arange(-reach, reach + 2) - 0.5 - fraction[:, None]) / (sigma * math.sqrt(2.0))
     weights = np.diff(erf(edges), axis=1)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
+
+
+class Tiers(Protocol):
+    """A view's log-likelihood ratios over a whole map, coarse and fine; see ``Belief.search_tiers``.
+
+    Attributes:
+        group: how many neighbouring headings share a coarse one; it divides the number of headings.
+        scale: cells of the belief per coarse cell and axis, 1 or 2. A coarse block has 16 x 16 coarse cells.
+        places: (n, 2) int32 rows and columns of the coarse blocks worth scoring.
+        bound: (coarse block rows, coarse block cols) float32, upper bounds of the ratios in all others.
+    """
+
+    group: int
+    scale: int
+    places: NDArray[np.int32]
+    bound: F32
+
+    def rough(self, keys: NDArray[np.int32]) -> F32:
+        """(n, 16, 16) ratios on coarse cells for keys (group, coarse block row, coarse block col)."""
+
+    def fine(self, keys: NDArray[np.int32]) -> F32:
+        """(n, 16, 16) ratios for keys (heading, block row, block col)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -482,6 +505,135 @@ class Belief:
         total = self._normalise()
         self.prune()
         return math.log(total)
+
+    def search_tiers(self, tiers: Tiers, low: float, high: float, weight: float = 1.0) -> float:
+        """As ``search``, at full resolution only where it may matter; returns the log of the evidence.
+
+        Full resolution have all listed blocks, and of the others the best ``FINE_SHARE`` by the coarse ratios. What else
+        stands out is listed with its coarse ratios: it is scored in full in the next frame. All other ground joins
+        ``rest`` with the mass that its coarse ratios, or their upper bounds, give it: what is passed over by mistake is
+        not lost, and while ``rest`` holds mass the next frame is searched anew.
+
+        Args:
+            tiers: the view's ratios.
+            low, high, weight: as in ``search``.
+        """
+        q, s = tiers.group, tiers.scale
+        side = BLOCK // s
+        coarse = tuple(-(-n // s) for n in self.grid)
+        groups = self.headings // q
+        # How many of a coarse cell's cells lie on the map, by row and by column.
+        inside = [
+            np.clip(self.shape[a] - s * np.arange(coarse[a] * BLOCK), 0, s).astype(np.float32) for a in (0, 1)
+        ]
+        count = [v.reshape(-1, side).sum(axis=1) for v in inside]
+        wide = (groups, coarse[0] * s, coarse[1] * s)
+        top, mass = np.full(wide, -np.inf, np.float32), np.zeros(wide, np.float32)
+        for g in range(groups):
+            keys = np.insert(tiers.places, 0, g, axis=1)
+            self._digest(tiers.rough(keys), tiers.places, inside, side, top[g], mass[g], low, high, weight)
+        scored = np.zeros(coarse, np.bool_)
+        scored[tiers.places[:, 0], tiers.places[:, 1]] = True
+        bound = _factor(np.where(scored, np.float32(-np.inf), tiers.bound), low, high, weight)
+        bound[scored] = 0.0
+        passed = float(count[0] @ bound.repeat(s, axis=0).repeat(s, axis=1) @ count[1]) * self.headings
+        top, mass = top[:, : self.grid[0], : self.grid[1]], mass[:, : self.grid[0], : self.grid[1]]
+
+        even = self.rest / self.cells
+        keys = self._best(top, q)
+        llr = tiers.fine(keys)
+        blocks = _factor(llr, low, high, weight)
+        listed = len(self.keys)
+        blocks[:listed] *= self.blocks + np.float32(even)
+        blocks[listed:] *= np.float32(even)
+        self._clear_outside(keys, blocks)
+        blocks[blocks < 1e-25] = 0.0
+        rough = np.repeat(mass * np.float32(even), q, axis=0)
+        rough[keys[:, 0], keys[:, 1], keys[:, 2]] = 0.0
+        total = (
+            float(blocks.sum(dtype=np.float64))
+            + float(rough.sum(dtype=np.float64))
+            + passed * even
+            + self.off
+        )
+
+        # Blocks of the whole belief that stand out, with the coarse ratios where there are no others.
+        own = _mass_of(blocks)[:, 0]
+        threshold = self.settings.keep * self._even_block * total
+        limit = self.settings.max_blocks
+        both = np.concatenate([own[own > threshold], rough[rough > threshold]])
+        if len(both) > limit:
+            threshold = max(threshold, float(np.partition(both, -limit)[-limit]))
+        stay = own > threshold
+        more = np.argwhere(rough > threshold).astype(np.int32)
+        parts = [blocks[stay]]
+        if len(more):
+            places, inverse = np.unique(more // np.array([q, s, s], np.int32), axis=0, return_inverse=True)
+            factor = _factor(tiers.rough(places), low, high, weight) * np.float32(even)
+            cut = factor.reshape(len(places), s, side, s, side).transpose(0, 1, 3, 2, 4)
+            cut = cut[inverse.ravel(), more[:, 1] % s, more[:, 2] % s]
+            parts.append(np.ascontiguousarray(cut.repeat(s, axis=1).repeat(s, axis=2)))
+            self._clear_outside(more, parts[1])
+        self._list(np.concatenate([keys[stay], more]), np.concatenate(parts))
+        self.rest = max(0.0, total - self.off - float(self.blocks.sum(dtype=np.float64)))
+        self._normalise()
+        self.prune()
+        return math.log(total)
+
+    FINE_SHARE = 0.1
+    FINE_LEAST, FINE_MOST = 8_000, 80_000
+
+    def _best(self, top: F32, group: int) -> NDArray[np.int32]:
+        """Keys to score in full: the listed ones first, then the unlisted headings of the best (group, block)s."""
+        blocks = top.size * group
+        want = min(max(self.FINE_SHARE * blocks, self.FINE_LEAST), self.FINE_MOST, blocks)
+        flat = top.ravel()
+        best = np.argpartition(flat, -max(1, int(want) // group))[-max(1, int(want) // group) :]
+        best = best[np.isfinite(flat[best])]
+        g, row, col = np.unravel_index(np.sort(best), top.shape)
+        h = (g[:, None] * group + np.arange(group)).ravel()
+        keys = np.stack([h, row.repeat(group), col.repeat(group)], axis=1).astype(np.int32)
+        fresh = self.index[keys[:, 0], keys[:, 1], keys[:, 2]] < 0
+        return np.concatenate([self.keys, keys[fresh]])
+
+    def _clear_outside(self, keys: NDArray[np.int32], blocks: F32) -> None:
+        """Zero in blocks what lies beyond the grid's last row and column."""
+        for axis in (0, 1):
+            last = np.flatnonzero(keys[:, 1 + axis] == self.grid[axis] - 1)
+            used = self.shape[axis] - (self.grid[axis] - 1) * BLOCK
+            if used < BLOCK:
+                blocks[(last, slice(used, None)) if axis == 0 else (last, slice(None), slice(used, None))] = (
+                    0.0
+                )
+
+    def _digest(
+        self,
+        llr: F32,
+        places: NDArray[np.int32],
+        inside: list[F32],
+        side: int,
+        top: F32,
+        mass: F32,
+        low: float,
+        high: float,
+        weight: float,
+    ) -> None:
+        """Largest ratio and summed likelihood ratio over the cells of each block, from coarse ratios (overwritten)."""
+        n, s = len(places), BLOCK // side
+        rows, cols = (v.reshape(-1, BLOCK)[places[:, a]] for a, v in enumerate(inside))
+        edge = np.flatnonzero((rows[:, -1] == 0) | (cols[:, -1] == 0))
+        llr[edge] = np.where(
+            (rows[edge, :, None] > 0) & (cols[edge, None, :] > 0), llr[edge], np.float32(-np.inf)
+        )
+        at = (
+            places[:, 0, None, None] * s + np.arange(s)[:, None],
+            places[:, 1, None, None] * s + np.arange(s),
+        )
+        top[at] = llr.reshape(n, s, side, s, side).max(axis=(2, 4))
+        factor = _factor(llr, low, high, weight)
+        factor *= rows[:, :, None]
+        factor *= cols[:, None, :]
+        mass[at] = factor.reshape(n, s, side, s, side).sum(axis=(2, 4))
 
     @staticmethod
     def _raise_threshold(keys: list[NDArray[np.int32]], parts: list[F32], limit: int) -> float:

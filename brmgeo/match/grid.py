@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from brmgeo.match.track import Track, wrap
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+Frame = Literal["odometry", "map", "body"]
 
 
 def check_view(view: View) -> None:
@@ -72,6 +74,7 @@ class GridMatcher(ABC):
         self._misses = 0
         self._off_frames = 0
         self._confirmed = False
+        self._frame: Frame = "odometry"
         self._unfixed_searches = 0
         self._since_informed_m = 0.0
         self._views: list[View] = []
@@ -85,14 +88,16 @@ class GridMatcher(ABC):
         """Prepare for scoring one view."""
 
     @abstractmethod
-    def _score_all(
-        self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
-    ) -> F32 | Callable[[int], F32 | None]:
-        """Ratios of all cells if no heading changes them, else a function of the heading bin, asked in order of bins."""
+    def _search(self, view: View, yaw_rad: float, body: F64 | None, weight: float) -> float:
+        """Weigh the belief by the view's ratios over the whole map; returns the log of the evidence.
+
+        ``yaw_rad`` is the body's yaw in the odometry frame; ``body`` is None, or (headings,) log weights of the body's
+        yaw in the map where the odometry does not know it.
+        """
 
     @abstractmethod
-    def _score_listed(self, view: View, yaw_rad: float) -> F32:
-        """(n, 16, 16) ratios of the belief's listed blocks."""
+    def _score_listed(self, view: View, yaw_rad: float, body: F64 | None) -> F32:
+        """(n, 16, 16) ratios of the belief's listed blocks; arguments as in ``_search``."""
 
     @abstractmethod
     def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
@@ -132,27 +137,35 @@ class GridMatcher(ABC):
         check_view(view)
         check_motion(motion, view)
         started = bool(self._views)
+        frame = _frame(motion)
+        if frame == "map":
+            motion = replace(motion, yaw_rad=motion.compass_yaw_rad)
         self._views.append(_packed(view))
         self._motions.append(motion)
         self._anchors.append(None)
         if started:
-            self._predict(motion)
-        if motion.compass_yaw_rad is not None and (motion.yaw_rad is not None or motion.step_m is None):
-            # Without odometry the belief's heading is the body's own.
-            self._weigh_compass(motion.compass_yaw_rad - (motion.yaw_rad or 0.0))
+            self._predict(motion, frame)
+        self._frame = frame
+        if motion.compass_yaw_rad is not None and motion.yaw_rad is not None:
+            like = self._compass_likelihood(motion.compass_yaw_rad - motion.yaw_rad)
+            self.belief.weigh_headings(like / like.mean())
         self._look(view)
         self._update(view, motion)
         mode = self.belief.mode(self.settings.belief.mode_radius_m / self.cell_m)
         return self._estimate(view, motion, mode)
 
-    def _predict(self, motion: Motion) -> None:
+    def _predict(self, motion: Motion, frame: Frame) -> None:
         odo = self.settings.odometry
         if motion.step_m is None:
             self.track, self._confirmed = None, False
             radius = max(1.0, odo.max_speed_m_s * motion.dt_s / self.cell_m)
-            keep = odo.reset_keeps_heading if motion.yaw_rad is not None else 0.0
+            keep = odo.reset_keeps_heading if motion.yaw_rad is not None and frame == self._frame else 0.0
             self.belief.predict_unknown(radius, keep)
             return
+        if frame != self._frame:
+            # The belief's heading was another frame's: the odometry's own is not known yet.
+            self.track, self._confirmed = None, False
+            self.belief.predict_unknown(1.0, 0.0)
         step = np.asarray(motion.step_m, np.float64)
         length = float(np.hypot(*step))
         scale, scale_sigma = 0.0, odo.scale_sigma
@@ -172,35 +185,36 @@ class GridMatcher(ABC):
         if self.track is not None:
             self.track.predict(motion, odo)
 
-    def _weigh_compass(self, heading_rad: float) -> None:
+    def _compass_likelihood(self, heading_rad: float) -> F64:
+        """(headings,) likelihood of each heading bin when a compass says ``heading_rad``."""
         bins = self.belief.heading_of(np.arange(self.belief.headings))
         apart = np.angle(np.exp(1j * (bins - heading_rad)))
         sigma = math.hypot(self.settings.odometry.compass_sigma_rad, math.pi / self.belief.headings)
-        like = np.exp(-0.5 * (apart / sigma) ** 2) + 1e-4
-        self.belief.weigh_headings(like / like.mean())
+        return np.asarray(np.exp(-0.5 * (apart / sigma) ** 2) + 1e-4)
 
     def _update(self, view: View, motion: Motion) -> None:
-        low, high = self._bounds()
         weight = self._novelty(view, motion)
-        yaw = motion.yaw_rad
+        yaw = motion.yaw_rad if motion.yaw_rad is not None else 0.0
+        body = self._body_weights(motion) if motion.yaw_rad is None and motion.step_m is not None else None
         known = self.belief.rest > 1e-3
         # Flying where the map does not reach must not cost a search each frame.
         if known and (
             self._unfixed_searches < 10 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)
         ):
-            wanted = np.ones(self.belief.headings, np.bool_)
-            score = self._score_all(view, yaw if yaw is not None else 0.0, wanted)
-            if yaw is None and motion.step_m is not None and not isinstance(score, np.ndarray):
-                score = self._any_heading(score)
-            gain = self.belief.search(score, low, high, weight)
-        elif yaw is None and motion.step_m is not None:
-            gain = self._update_any_heading(view, low, high, weight)
+            gain = self._search(view, yaw, body, weight)
         else:
-            listed = self._score_listed(view, yaw if yaw is not None else 0.0)
-            gain = self.belief.update(listed, low, high, weight)
+            gain = self.belief.update(self._score_listed(view, yaw, body), *self._bounds(), weight)
         self._unfixed_searches += 1
         if gain > 2.0:
             self._since_informed_m = 0.0
+
+    def _body_weights(self, motion: Motion) -> F64:
+        """(headings,) log weights of the body's yaw in the map where the odometry knows the step but not the yaw."""
+        n = self.belief.headings
+        if motion.compass_yaw_rad is None:
+            return np.full(n, -math.log(n))
+        weight = self._compass_likelihood(motion.compass_yaw_rad)
+        return np.asarray(np.log(weight / weight.sum()))
 
     def _novelty(self, view: View, motion: Motion) -> float:
         """Weight of the view's evidence, by the share of it that the view before did not show; 1 if unknown."""
@@ -209,36 +223,6 @@ class GridMatcher(ABC):
         area, repeat = self._evidence(view)
         # Even a view of old ground says a little: its mask has errors of its own.
         return min(1.0, max(0.02, repeat * float(np.hypot(*motion.step_m)) / math.sqrt(max(area, 1.0))))
-
-    def _any_heading(self, score: Callable[[int], F32 | None]) -> Callable[[int], F32 | None]:
-        """Ratios where the body's heading is unknown but the odometry's is not: the mean over headings, for all."""
-        top = None
-        for h in range(self.belief.headings):
-            llr = score(h)
-            if llr is not None:
-                top = llr.copy() if top is None else np.logaddexp(top, llr)
-        assert top is not None
-        mean = np.asarray(top - math.log(self.belief.headings), np.float32)
-        return lambda h: mean.copy()
-
-    def _update_any_heading(self, view: View, low: float, high: float, weight: float) -> float:
-        """The same at listed blocks: every place that is listed under any heading is scored under all."""
-        belief = self.belief
-        places, inverse = np.unique(belief.keys[:, 1:], axis=0, return_inverse=True)
-        n = belief.headings
-        keys = belief.keys
-        total: NDArray[np.float32] | None = None
-        try:
-            for h in range(n):
-                belief.keys = np.concatenate([np.full((len(places), 1), h), places], axis=1).astype(np.int32)
-                llr = self._score_listed(view, 0.0)
-                total = llr if total is None else np.asarray(np.logaddexp(total, llr), np.float32)
-        finally:
-            belief.keys = keys
-        if total is None:
-            return 0.0
-        llr = np.ascontiguousarray((total - np.float32(math.log(n)))[inverse.ravel()])
-        return belief.update(llr, low, high, weight)
 
     # From belief to estimate
 
@@ -303,6 +287,8 @@ class GridMatcher(ABC):
             yaw = wrap(heading + motion.yaw_rad)
         elif motion.step_m is None:
             yaw = wrap(heading)
+        elif motion.compass_yaw_rad is not None:
+            yaw, heading_sigma = wrap(motion.compass_yaw_rad), self.settings.odometry.compass_sigma_rad
         else:
             yaw, heading_sigma = math.nan, math.nan
         return Estimate(
@@ -338,8 +324,18 @@ class GridMatcher(ABC):
         pose = np.array([*track.mean[:2], track.mean[2] + turn])
         pose_cov = track.covariance[:3, :3].copy()
         if body is None and motion.step_m is not None:
-            return track.mean[:2].copy(), track.covariance[:2, :2].copy(), heading, heading_sigma
+            if motion.compass_yaw_rad is None:
+                return track.mean[:2].copy(), track.covariance[:2, :2].copy(), heading, heading_sigma
+            pose[2] = motion.compass_yaw_rad
+            pose_cov[2, :] = pose_cov[:, 2] = 0.0
+            pose_cov[2, 2] = odo.compass_sigma_rad**2
         anchor = self._measure(view, pose, pose_cov)
+        if anchor is not None and body is None and motion.step_m is not None:
+            # The body's yaw says nothing of the odometry frame's heading.
+            place = anchor.covariance.copy()
+            place[2, :] = place[:, 2] = 0.0
+            place[2, 2] = math.pi**2
+            anchor = Anchor(np.array([*anchor.pose[:2], track.mean[2]]), place, anchor.fit)
         if anchor is not None:
             d2 = track.distance2(anchor.pose, anchor.covariance, turn)
             if d2 < 16.3 or fresh:
@@ -383,6 +379,14 @@ class GridMatcher(ABC):
         )
         lasting = np.array([self._lasting_m(v) for v in self._views])
         return SmoothedPath(path.t_s, path.xy, path.yaw_rad, np.hypot(path.sigma_m, lasting))
+
+
+def _frame(motion: Motion) -> Frame:
+    """What the belief's heading is counted from: without odometry, the map's axes if a compass gives the body's yaw,
+    else the body itself."""
+    if motion.step_m is not None or motion.yaw_rad is not None:
+        return "odometry"
+    return "map" if motion.compass_yaw_rad is not None else "body"
 
 
 def _packed(view: View) -> View:

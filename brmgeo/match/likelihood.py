@@ -8,7 +8,9 @@ Per patch
     llr = k [c log(P1/pb) + (m-c) log(P0/pb)] + (w-k) [c log((1-P1)/(1-pb)) + (m-c) log((1-P0)/(1-pb))] = c a + m b,
 
 so a heading costs one correlation of the building cover with ``a`` and, where ground is unknown, one of the
-known cover with ``b``. Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings,
+known cover with ``b``. A whole map is searched in three tiers (``MaskScorer``): the ratio feature of a disc bounds
+what any heading can reach, cells twice as large and headings twice as wide rank what is left, and the best of
+these are scored at full resolution. Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings,
 so a patch counts as its area over the area that carries one independent observation. pb is kept within [P0,
 P1]: a blank view then says nothing in favour of any place, it only speaks against built-up ones.
 
@@ -22,19 +24,18 @@ its cells, half and half with an even spread over rings.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numba as nb
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from brmgeo.flight.values import View
+from brmgeo.maps.ratio import _Disjoint
 from brmgeo.match.belief import BLOCK
 from brmgeo.match.settings import RateSettings, RatioSettings
-from brmgeo.match.threads import THREADS, pool, split
+from brmgeo.match.threads import split
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -216,156 +217,252 @@ def mask_templates(
     return np.float32(a_k) * k + np.float32(a_o) * w, np.float32(b_k) * k + np.float32(b_o) * w
 
 
+@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=_Disjoint)
+def _correlate_blocks(cover, cols, first, template, low, high, heading, out, t0, t1):  # type: ignore[no-untyped-def]
+    """Adds to out[t] (256,) the correlation of a cover with template[heading[t]] at the 16 x 16 cells of a block.
+
+    cover is flat with ``cols`` to a row; first[t] is where the block's upper left cell meets the template's; row v of
+    a template is zero outside [low[h, v], high[h, v]). Four rows at a time stay in registers, if the compiler knows
+    that arrays do not overlap. Positions are unsigned: signed ones would be tested for counting from the end, and the
+    loop would not be vectorised.
+    """
+    c = np.uint64(cols)
+    for t in range(t0, t1):
+        h = heading[t]
+        for i in range(0, BLOCK, 4):
+            acc = np.zeros(4 * BLOCK, np.float32)
+            for v in range(template.shape[1]):
+                line = first[t] + (i + v) * cols
+                for u in range(low[h, v], high[h, v]):
+                    w = template[h, v, u]
+                    p = np.uint64(line + u)
+                    for j in range(BLOCK):
+                        k = np.uint64(j)
+                        acc[k] += w * cover[p + k]
+                        acc[k + np.uint64(16)] += w * cover[p + c + k]
+                        acc[k + np.uint64(32)] += w * cover[p + c + c + k]
+                        acc[k + np.uint64(48)] += w * cover[p + c + c + c + k]
+            for n in range(4 * BLOCK):
+                out[t, i * BLOCK + n] += acc[n]
+
+
 class MapCover:
-    """The map's building and known cover on the grid of cells, ready for correlation with templates.
+    """The map's building and known cover on a grid of cells, ready for correlation with templates.
 
     Args:
         built, known: (rows, cols) float32 shares of the cells.
     """
 
-    TILE = 1024
-
     def __init__(self, built: F32, known: F32) -> None:
-        self.built, self.known = built, known
         self.shape = built.shape
-        self._margin = -1
-        self._built_pad = self._known_pad = np.empty((0, 0), np.float32)
-        self._reach = -1
+        self.blocks = (-(-built.shape[0] // BLOCK), -(-built.shape[1] // BLOCK))
+        self._covers = (built, known)
+        self._margin = 0
+        self._gaps = self._unknown_blocks(known)
+        self._near_gap: tuple[int, NDArray[np.bool_]] | None = None
+        self._most: tuple[int, F32] | None = None
 
-    def padded(self, margin: int) -> tuple[F32, F32]:
-        """Both covers with at least ``margin`` cells of unknown ground around, rows and cols to whole blocks."""
-        if margin > self._margin:
-            rows, cols = self.shape
-            after = (margin + -rows % BLOCK, margin + -cols % BLOCK)
-            pad = ((margin, after[0]), (margin, after[1]))
-            self._built_pad, self._known_pad = np.pad(self.built, pad), np.pad(self.known, pad)
-            self._margin = margin
-        cut = self._margin - margin
-        view = (slice(cut, None), slice(cut, None))
-        return self._built_pad[view], self._known_pad[view]
+    @property
+    def built(self) -> F32:
+        """(rows, cols) building share of the cells."""
+        return self._inner(0)
+
+    @property
+    def known(self) -> F32:
+        """(rows, cols) known share of the cells."""
+        return self._inner(1)
+
+    def _inner(self, which: int) -> F32:
+        m = self._margin
+        return self._covers[which][m : m + self.shape[0], m : m + self.shape[1]]
+
+    def coarser(self) -> MapCover:
+        """The same ground in cells twice as large; what lies beyond the edge is unknown."""
+        rows, cols = (-(-n // 2) for n in self.shape)
+        halves = []
+        for which in (0, 1):
+            total = np.zeros((rows, cols), np.float32)
+            for i in (0, 1):
+                for j in (0, 1):
+                    part = self._inner(which)[i::2, j::2]
+                    total[: part.shape[0], : part.shape[1]] += part
+            total *= np.float32(0.25)
+            halves.append(total)
+        return MapCover(halves[0], halves[1])
 
     def score_blocks(self, keys: NDArray[np.int32], a: F32, b: F32) -> F32:
-        """Ratios at listed blocks: (n, 16, 16) float32 for keys (heading, block row, block col); a, b by heading."""
-        out = np.empty((len(keys), BLOCK, BLOCK), np.float32)
+        """Ratios at blocks: (n, 16, 16) float32 for keys (heading, block row, block col); a, b by heading.
+
+        Cells beyond the map get a ratio as well, of the ground that their view would show.
+        """
+        out = np.zeros((len(keys), BLOCK * BLOCK), np.float32)
         if len(keys):
             reach = a.shape[1] // 2
-            built, known = self.padded(reach)
-            split(lambda t0, t1: _score_blocks(built, known, keys, a, b, out, t0, t1), len(keys), 16)
-        return out
+            self._widen(reach)
+            near = self._near_unknown(reach)[keys[:, 1], keys[:, 2]]
+            # Where all ground in reach is known, the second correlation is the template's sum.
+            out[~near] = b.sum(axis=(1, 2))[keys[~near, 0], None]
+            self._correlate(0, keys, a, out)
+            some = np.zeros((int(near.sum()), BLOCK * BLOCK), np.float32)
+            self._correlate(1, keys[near], b, some)
+            out[near] += some
+        return out.reshape(-1, BLOCK, BLOCK)
 
-    def score_all(self, a: F32, b: F32, wanted: NDArray[np.bool_]) -> Iterator[F32 | None]:
-        """Ratios at every cell, heading by heading: (rows, cols) float32, or None where ``wanted`` is False.
+    def most_built(self, radius: int) -> F32:
+        """(block rows, block cols) float32: the most building, in cells, that any cell of a block has within ``radius``
+        cells of it; infinite where ground in that reach is unknown."""
+        if self._most is None or self._most[0] != radius:
+            y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+            disc = (x**2 + y**2 <= radius**2).astype(np.float32)
+            sums = cv2.filter2D(
+                np.ascontiguousarray(self.built), cv2.CV_32F, disc, borderType=cv2.BORDER_CONSTANT
+            )
+            rows, cols = (n * BLOCK for n in self.blocks)
+            whole = np.zeros((rows, cols), np.float32)
+            whole[: sums.shape[0], : sums.shape[1]] = sums
+            most = whole.reshape(self.blocks[0], BLOCK, self.blocks[1], BLOCK).max(axis=(1, 3))
+            most[self._near_unknown(radius)] = np.inf
+            self._most = (radius, most)
+        return self._most[1]
 
-        By Fourier transforms of tiles of at most 1024 cells, a few headings at a time, so memory does not
-        follow the number of headings. The known cover's part varies slowly: it is summed on cells four times
-        as large and interpolated, which changes the ratio only near the edge of known ground, by a few
-        hundredths of the template's sum at most.
-        """
-        reach = a.shape[1] // 2
-        self._prepare(reach)
-        for first in range(0, len(a), THREADS):
-            some = [h for h in range(first, min(first + THREADS, len(a))) if wanted[h]]
-            outs = pool().map(lambda h: self._correlate(a[h], b[h], reach), some)
-            for h in range(first, min(first + THREADS, len(a))):
-                yield next(outs) if wanted[h] else None
-
-    def _prepare(self, reach: int) -> None:
-        """Tiles, their size and, for small maps, their spectra for templates of this reach."""
-        if self._reach == reach:
-            return
-        self._reach = reach
-        rows, cols = self.shape
-        core = self.TILE - 2 * reach if max(self.shape) > self.TILE else max(self.shape)
-        if core < 64:
-            core = max(self.shape)
-        self._tiles = [
-            (r, c, min(core, rows - r), min(core, cols - c))
-            for r in range(0, rows, core)
-            for c in range(0, cols, core)
-        ]
-        self._size = (
-            scipy.fft.next_fast_len(min(rows, core) + 2 * reach, real=True),
-            scipy.fft.next_fast_len(min(cols, core) + 2 * reach, real=True),
+    def _correlate(self, which: int, keys: NDArray[np.int32], template: F32, out: F32) -> None:
+        cover, margin, reach = self._covers[which], self._margin, template.shape[1] // 2
+        cols = cover.shape[1]
+        row, col = (keys[:, n].astype(np.int64) * BLOCK + margin - reach for n in (1, 2))
+        filled = template != 0
+        some = filled.any(axis=2)
+        low = np.where(some, filled.argmax(axis=2), 0)
+        high = np.where(some, template.shape[2] - filled[:, :, ::-1].argmax(axis=2), 0)
+        flat, first, heading = cover.reshape(-1), row * cols + col, keys[:, 0].astype(np.int64)
+        split(
+            lambda t0, t1: _correlate_blocks(flat, cols, first, template, low, high, heading, out, t0, t1),
+            len(keys),
+            16,
         )
-        self._spectra: list[NDArray[np.complex64] | None] = []
-        built, known = self.padded(reach)
-        keep = len(self._tiles) <= 16
-        for r, c, h, w in self._tiles:
-            cut = built[r : r + h + 2 * reach, c : c + w + 2 * reach]
-            # Without a building in reach the correlation with ``a`` is zero; without room to keep it, it is made anew.
-            self._spectra.append(scipy.fft.rfft2(cut, s=self._size) if keep and cut.any() else None)
-        self._keep = keep
-        n, m = -(-known.shape[0] // 4), -(-known.shape[1] // 4)
-        wide = np.zeros((n * 4, m * 4), np.float32)
-        wide[: known.shape[0], : known.shape[1]] = known
-        coarse = wide.reshape(n, 4, m, 4).mean(axis=(1, 3))
-        self._coarse_size = (scipy.fft.next_fast_len(n, real=True), scipy.fft.next_fast_len(m, real=True))
-        self._coarse_known = scipy.fft.rfft2(coarse, s=self._coarse_size)
 
-    def _correlate(self, a: F32, b: F32, reach: int) -> F32:
-        rows, cols = self.shape
-        side = -(-b.shape[0] // 4) * 4
-        wide = np.zeros((side, side), np.float32)
-        wide[: b.shape[0], : b.shape[1]] = b
-        sums = wide.reshape(side // 4, 4, side // 4, 4).sum(axis=(1, 3))
-        product = np.conj(scipy.fft.rfft2(sums, s=self._coarse_size))
-        product *= self._coarse_known
-        slow = scipy.fft.irfft2(product, s=self._coarse_size, overwrite_x=True)
-        affine = np.array([[0.25, 0.0, 0.0], [0.0, 0.25, 0.0]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        out: F32 = cv2.warpAffine(slow, affine, (cols, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        template: NDArray[np.complex64] | None = None
-        built, _ = self.padded(reach)
-        for (r, c, h, w), kept in zip(self._tiles, self._spectra):
-            spectrum = kept
-            if spectrum is None:
-                cut = built[r : r + h + 2 * reach, c : c + w + 2 * reach]
-                if self._keep or not cut.any():
-                    continue
-                spectrum = scipy.fft.rfft2(cut, s=self._size)
-            if template is None:
-                template = np.conj(scipy.fft.rfft2(a, s=self._size))
-            fast = scipy.fft.irfft2(spectrum * template, s=self._size, overwrite_x=True)
-            out[r : r + h, c : c + w] += fast[:h, :w]
+    def _widen(self, margin: int) -> None:
+        """See that there are at least ``margin`` cells of unknown ground around, rows and cols to whole blocks."""
+        if margin > self._margin or self._margin == 0:
+            shape = tuple(n * BLOCK + 2 * margin for n in self.blocks)
+            inner = (slice(margin, margin + self.shape[0]), slice(margin, margin + self.shape[1]))
+            wide = []
+            for which in (0, 1):
+                wide.append(np.zeros(shape, np.float32))
+                wide[-1][inner] = self._inner(which)
+            self._covers, self._margin = (wide[0], wide[1]), margin
+
+    def _unknown_blocks(self, known: F32) -> NDArray[np.bool_]:
+        """(block rows, block cols): whether a block holds unknown ground, beyond the map's edge included."""
+        out = np.ones(self.blocks, np.bool_)
+        full = (known.shape[0] // BLOCK, known.shape[1] // BLOCK)
+        for i in range(full[0]):
+            band = known[i * BLOCK : (i + 1) * BLOCK, : full[1] * BLOCK].reshape(BLOCK, full[1], BLOCK)
+            out[i, : full[1]] = (band < 0.9999).any(axis=(0, 2))
         return out
 
+    def _near_unknown(self, reach: int) -> NDArray[np.bool_]:
+        """(block rows, block cols): whether a block with unknown ground is in reach of a block."""
+        far = -(-reach // BLOCK)
+        if self._near_gap is None or self._near_gap[0] != far:
+            wide = np.pad(self._gaps, far, constant_values=True).astype(np.uint8)
+            near = cv2.dilate(wide, np.ones((2 * far + 1, 2 * far + 1), np.uint8))
+            inner = near[far : far + self.blocks[0], far : far + self.blocks[1]]
+            self._near_gap = (far, inner.astype(np.bool_))
+        return self._near_gap[1]
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _score_blocks(built, known, keys, a, b, out, t0, t1):  # type: ignore[no-untyped-def]
-    size = a.shape[1]
-    for t in range(t0, t1):
-        h, top, left = keys[t, 0], keys[t, 1] * BLOCK, keys[t, 2] * BLOCK
-        acc = np.zeros((BLOCK, BLOCK), np.float32)
-        # Where all ground in reach is known, the second correlation is the template's sum.
-        whole = True
-        for i in range(top, top + BLOCK + size - 1):
-            for j in range(left, left + BLOCK + size - 1):
-                if known[i, j] < 0.9999:
-                    whole = False
-                    break
-            if not whole:
-                break
-        total = np.float32(0.0)
-        for oy in range(size):
-            for ox in range(size):
-                va, vb = a[h, oy, ox], b[h, oy, ox]
-                if va == 0.0 and vb == 0.0:
-                    continue
-                if whole:
-                    total += vb
-                    for i in range(BLOCK):
-                        row = built[top + i + oy]
-                        for j in range(BLOCK):
-                            acc[i, j] += va * row[left + ox + j]
-                else:
-                    for i in range(BLOCK):
-                        row = built[top + i + oy]
-                        other = known[top + i + oy]
-                        for j in range(BLOCK):
-                            acc[i, j] += va * row[left + ox + j] + vb * other[left + ox + j]
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                out[t, i, j] = acc[i, j] + total
+
+def ceiling(points: ViewPoints, rates: Rates) -> tuple[F64, F64]:
+    """The most that the mask's ratio can be over known ground with so much building in the view's reach.
+
+    The building may lie anywhere in reach: it is laid under the patches that gain most by it. So the bound needs
+    nothing but the ratio feature of a disc, holds for all headings, and no place above a limit can be missed by it.
+
+    Returns (n,) square metres of building, increasing from 0, and (n,) the ratio's upper bound there; beyond the last
+    the bound stays.
+    """
+    a_k, a_o, b_k, b_o = rates.weights(points.rate)
+    other = points.known - points.built
+    gain = (a_k * points.built + a_o * other).astype(np.float64)
+    base = float((b_k * points.built + b_o * other).sum(dtype=np.float64))
+    order = np.argsort(-gain / points.known)
+    order = order[gain[order] > 0]
+    area = np.concatenate([[0.0], np.cumsum(points.known[order], dtype=np.float64)])
+    return area, base + np.concatenate([[0.0], np.cumsum(gain[order])])
+
+
+class MaskTiers:
+    """One view's ratios over a whole map in three tiers, for ``Belief.search_tiers``.
+
+    First the ratio feature of the disc about a place, which needs no heading, bounds what any heading can reach there
+    (``ceiling``): blocks that stay below ``PRUNE`` are not looked at again. Then larger cells and headings of 10
+    degrees are scored; the belief asks for full resolution only where these are best.
+
+    Args:
+        points: the view in patches of half a cell: shared between cells, their own size is not in the templates.
+        cover, coarse: the map in the belief's cells, and in cells ``scale`` times as large.
+        scale: 1 or 2.
+        cell_m: size of the belief's cells, metres.
+        yaw_rad: (headings,) yaw of the body in the map for each heading of the belief, evenly spaced.
+        rates: P1, P0 and the independent area.
+        weight: factor that the belief will put on the ratios.
+        body: None, or (headings,) log weights of the body's yaws, normalised, where the yaw does not follow from the
+            belief's heading: then a ratio is the mean over them, the same for all headings.
+    """
+
+    PRUNE = -6.0
+
+    def __init__(
+        self,
+        points: ViewPoints,
+        cover: MapCover,
+        coarse: MapCover,
+        scale: int,
+        cell_m: float,
+        yaw_rad: F64,
+        rates: Rates,
+        weight: float,
+        body: F64 | None = None,
+    ) -> None:
+        n = len(yaw_rad)
+        merged = n // 36 if n % 36 == 0 else 1
+        self.scale = scale
+        self.group = merged if body is None else n
+        self._cover, self._coarse = cover, coarse
+        self._fine = mask_templates(points, yaw_rad, cell_m, rates)
+        middle = yaw_rad[::merged] + (merged - 1) * math.pi / n
+        self._rough = mask_templates(points, middle, scale * cell_m, rates)
+        self._body = body
+        self._rough_body = None if body is None else np.logaddexp.reduce(body.reshape(-1, merged), axis=1)
+        area, bound = ceiling(points, rates)
+        side = scale * cell_m
+        built = coarse.most_built(math.ceil(points.reach_m / side) + 1).astype(np.float64) * side**2
+        self.bound = np.interp(built, area, bound).astype(np.float32)
+        self.bound[np.isinf(built)] = np.inf
+        self.places = np.argwhere(self.bound * weight > self.PRUNE).astype(np.int32)
+
+    def rough(self, keys: NDArray[np.int32]) -> F32:
+        """(n, 16, 16) ratios on coarse cells for keys (group of headings, coarse block row, coarse block col)."""
+        if self._rough_body is None:
+            return self._coarse.score_blocks(keys, *self._rough)
+        return _over_yaws(self._coarse, keys[:, 1:], self._rough, self._rough_body)
+
+    def fine(self, keys: NDArray[np.int32]) -> F32:
+        """(n, 16, 16) ratios for keys (heading, block row, block col)."""
+        if self._body is None:
+            return self._cover.score_blocks(keys, *self._fine)
+        places, inverse = np.unique(keys[:, 1:], axis=0, return_inverse=True)
+        return _over_yaws(self._cover, places, self._fine, self._body)[inverse.ravel()]
+
+
+def _over_yaws(
+    cover: MapCover, places: NDArray[np.int32], templates: tuple[F32, F32], log_weight: F64
+) -> F32:
+    """(n, 16, 16) ratios at places (row, col of blocks), as the weighted mean of the likelihoods over yaws."""
+    total = np.full((len(places), BLOCK, BLOCK), -np.inf, np.float32)
+    for h in np.flatnonzero(log_weight > log_weight.max() - 15.0):
+        keys = np.concatenate([np.full((len(places), 1), h), places], axis=1).astype(np.int32)
+        np.logaddexp(total, cover.score_blocks(keys, *templates) + np.float32(log_weight[h]), out=total)
+    return total
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,14 @@ from numpy.typing import NDArray
 from brmgeo.flight.values import View
 from brmgeo.match.grid import GridMatcher
 from brmgeo.match.ground import GroundMap
-from brmgeo.match.likelihood import MapCover, RateLearner, ViewPoints, mask_templates, view_points
+from brmgeo.match.likelihood import (
+    MapCover,
+    MaskTiers,
+    RateLearner,
+    ViewPoints,
+    mask_templates,
+    view_points,
+)
 from brmgeo.match.register import Registrar
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor
@@ -26,6 +32,9 @@ class MaskMatcher(GridMatcher):
     def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
         super().__init__(ground, settings)
         self._cover = MapCover(*ground.coverage(self.cell_px))
+        # Of cells of 10 m and more, larger ones would tell nothing of single buildings.
+        self._scale = 2 if self.cell_m < 10.0 else 1
+        self._coarse = self._cover.coarser() if self._scale == 2 else self._cover
         self._registrar = Registrar(ground)
         self._learner = RateLearner(settings.rates)
         self._points: ViewPoints | None = None
@@ -43,24 +52,35 @@ class MaskMatcher(GridMatcher):
         return float(np.count_nonzero(view.known)) * view.gsd_m**2, self.settings.rates.repeat
 
     def _look(self, view: View) -> None:
-        # Patches of half a cell, their area shared between cells, keep the patches' own size out of the templates.
         self._points = view_points(view, self.cell_m / 2.0)
 
-    def _templates(self, yaw_rad: float, wanted: NDArray[np.bool_]) -> tuple[F32, F32]:
+    def _tiers(self, yaw_rad: float, body: F64 | None, weight: float) -> MaskTiers:
         assert self._points is not None
         yaw = self.belief.heading_of(np.arange(self.belief.headings)) + yaw_rad
-        return mask_templates(self._points, yaw, self.cell_m, self._learner.rates, wanted)
+        return MaskTiers(
+            self._points,
+            self._cover,
+            self._coarse,
+            self._scale,
+            self.cell_m,
+            yaw,
+            self._learner.rates,
+            weight,
+            body,
+        )
 
-    def _score_all(
-        self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
-    ) -> Callable[[int], F32 | None]:
-        scores = self._cover.score_all(*self._templates(yaw_rad, wanted), wanted)
-        return lambda h: next(scores)
+    def _search(self, view: View, yaw_rad: float, body: F64 | None, weight: float) -> float:
+        return self.belief.search_tiers(self._tiers(yaw_rad, body, weight), *self._bounds(), weight)
 
-    def _score_listed(self, view: View, yaw_rad: float) -> F32:
+    def _score_listed(self, view: View, yaw_rad: float, body: F64 | None) -> F32:
+        assert self._points is not None
+        if body is not None:
+            return self._tiers(yaw_rad, body, 1.0).fine(self.belief.keys)
         wanted = np.zeros(self.belief.headings, np.bool_)
         wanted[self.belief.keys[:, 0]] = True
-        return self._cover.score_blocks(self.belief.keys, *self._templates(yaw_rad, wanted))
+        yaw = self.belief.heading_of(np.arange(self.belief.headings)) + yaw_rad
+        templates = mask_templates(self._points, yaw, self.cell_m, self._learner.rates, wanted)
+        return self._cover.score_blocks(self.belief.keys, *templates)
 
     def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
         sigma = math.sqrt(max(float(covariance[0, 0]), float(covariance[1, 1])))

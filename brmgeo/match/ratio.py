@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,18 +88,17 @@ class RatioMatcher(GridMatcher):
         top = float(values.max())
         return top + math.log(float(np.exp(values - top).sum(dtype=np.float64))), len(values)
 
-    def _score_all(
-        self, view: View, yaw_rad: float, wanted: NDArray[np.bool_]
-    ) -> F32 | Callable[[int], F32 | None]:
+    def _search(self, view: View, yaw_rad: float, body: F64 | None, weight: float) -> float:
         loglik = self._at_blocks(self._every)
         total, count = self._mean(loglik, self._every)
         rows, cols = self.belief.shape
         n, m = self.belief.grid
         field = loglik.reshape(n, m, BLOCK, BLOCK).transpose(0, 2, 1, 3).reshape(n * BLOCK, m * BLOCK)
         background = self._background(total - math.log(count))
-        return np.asarray(field[:rows, :cols] - np.float32(background), np.float32)
+        llr = np.asarray(field[:rows, :cols] - np.float32(background), np.float32)
+        return self.belief.search(llr, *self._bounds(), weight)
 
-    def _score_listed(self, view: View, yaw_rad: float) -> F32:
+    def _score_listed(self, view: View, yaw_rad: float, body: F64 | None) -> F32:
         code = self.belief.keys[:, 1] * np.int32(self.belief.grid[1]) + self.belief.keys[:, 2]
         unique, inverse = np.unique(code, return_inverse=True)
         blocks = self._every[unique]

@@ -27,6 +27,7 @@ from brmgeo.match.belief import BLOCK, Belief
 from brmgeo.match.ground import DiscAreas, _chords, disc_pixels
 from brmgeo.match.likelihood import (
     MapCover,
+    MaskTiers,
     RateLearner,
     Rates,
     Rings,
@@ -162,7 +163,6 @@ def test_mask_ratio_equals_the_formula() -> None:
                 view_k[h, i + di, j + dj] += share * k
                 view_w[h, i + di, j + dj] += share * w
     cover = MapCover(built, known)
-    whole = [x.copy() for x in cover.score_all(a, b, np.ones(2, np.bool_)) if x is not None]
     keys = np.array([[0, 0, 1], [1, 1, 2], [1, 2, 3], [0, 2, 0]], np.int32)
     listed = cover.score_blocks(keys, a, b)
     rng = np.random.default_rng(5)
@@ -174,23 +174,113 @@ def test_mask_ratio_equals_the_formula() -> None:
                 continue
             expected = llr_by_definition(view_k[h], view_w[h], built, known, at, points.rate, RATES)
             assert listed[n, i, j] == pytest.approx(expected, abs=2e-3)
-            # The transform sums the slowly varying known part on coarser cells.
-            assert whole[h][at] == pytest.approx(expected, abs=0.12)
 
 
-def test_transform_in_tiles_equals_one_transform() -> None:
-    rng = np.random.default_rng(6)
-    built = (rng.random((150, 190)) < 0.1).astype(np.float32)
-    known = np.ones_like(built)
-    points = view_points(view_at(town(1, 600.0, 150), 1300, 5300, 0.7), 2.5)
-    a, b = mask_templates(points, np.array([0.4]), 5.0, RATES)
-    one = next(iter(MapCover(built, known).score_all(a, b, np.ones(1, np.bool_))))
-    tiled = MapCover(built, known)
-    tiled.TILE = 128
-    many = next(iter(tiled.score_all(a, b, np.ones(1, np.bool_))))
+def tiers_of(
+    seed: int, headings: int = 72, weight: float = 1.0, size_m: float = 700.0, count: int = 300
+) -> tuple[MaskTiers, MapCover, np.ndarray]:
+    """A view's tiers over a town with unknown ground in one corner, with the cover and the place of the truth."""
+    scene = town(seed, size_m, count)
+    ground = scene.ground(1.0)
+    ground.building[:60, :90] = 255
+    ground.building[round(0.62 * size_m) :] *= size_m < 1000
+    cover = MapCover(*ground.coverage(5))
+    truth = np.array([1000 + 0.55 * size_m, 5000 + 0.45 * size_m])
+    points = view_points(view_at(scene, *truth, 0.9, missed=0.1, rng=np.random.default_rng(seed)), 2.5)
+    yaw = np.arange(headings) * (2 * math.pi / headings)
+    tiers = MaskTiers(points, cover, cover.coarser(), 2, 5.0, yaw, RATES, weight)
+    return tiers, cover, np.array([(5000 + size_m - truth[1]) / 5, (truth[0] - 1000) / 5])
+
+
+def all_blocks(cover: MapCover, headings: int) -> np.ndarray:
+    h, i, j = np.mgrid[0:headings, 0 : cover.blocks[0], 0 : cover.blocks[1]]
+    return np.stack([h.ravel(), i.ravel(), j.ravel()], axis=1).astype(np.int32)
+
+
+def dense_ratios(tiers: MaskTiers, cover: MapCover, headings: int) -> np.ndarray:
+    """(headings, rows, cols) ratios at full resolution."""
+    n, m = cover.blocks
+    llr = tiers.fine(all_blocks(cover, headings)).reshape(headings, n, m, BLOCK, BLOCK)
+    whole = llr.transpose(0, 1, 3, 2, 4).reshape(headings, n * BLOCK, m * BLOCK)
+    return np.ascontiguousarray(whole[:, : cover.shape[0], : cover.shape[1]])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_place_exceeds_the_bound_of_its_ratio_feature(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MaskTiers, "PRUNE", -1.0)
+    # Open ground in the south, so that the bound rules something out.
+    tiers, cover, _ = tiers_of(seed, headings=36, size_m=1600.0, count=1200)
+    llr = tiers.fine(all_blocks(cover, 36)).reshape(36, *cover.blocks, BLOCK, BLOCK).max(axis=(0, 3, 4))
+    bound = tiers.bound.repeat(2, axis=0).repeat(2, axis=1)[: cover.blocks[0], : cover.blocks[1]]
+    assert (llr <= bound + 0.02).all()
+    scored = np.zeros(tiers.bound.shape, np.bool_)
+    scored[tuple(tiers.places.T)] = True
+    assert scored.any()
+    assert not scored.all()
+    assert (tiers.bound[~scored] <= MaskTiers.PRUNE).all()
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.3])
+def test_tiers_equal_bayes_where_all_is_scored_in_full(
+    weight: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Belief, "FINE_LEAST", 10**9)
+    monkeypatch.setattr(Belief, "FINE_MOST", 10**9)
+    monkeypatch.setattr(MaskTiers, "PRUNE", -math.inf)
+    tiers, cover, _ = tiers_of(4, weight=weight)
+    llr = dense_ratios(tiers, cover, 72)
+    one, two = (Belief(cover.shape, BeliefSettings(keep=1e-9)) for _ in range(2))
+    for belief in (one, two):
+        # A second view upon the first: some ground is listed by then.
+        for k in range(2):
+            if belief is one:
+                gain = belief.search(lambda h: llr[h].copy(), -8.0, 25.0, weight)
+            else:
+                assert (
+                    belief.search_tiers(tiers, -8.0, 25.0, weight) == pytest.approx(gain, abs=1e-3) or k == 0
+                )
+    np.testing.assert_allclose(dense(two), dense(one), rtol=2e-3, atol=1e-9)
+    assert two.off == pytest.approx(one.off, rel=1e-3)
+    assert two.rest == pytest.approx(one.rest, rel=1e-2, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [5, 7, 8, 10])
+def test_tiers_find_what_a_full_search_finds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Belief, "FINE_LEAST", 0)
+    tiers, cover, truth = tiers_of(seed)
+    llr = dense_ratios(tiers, cover, 72)
+    full, quick = (Belief(cover.shape, BeliefSettings()) for _ in range(2))
+    gain = full.search(lambda h: llr[h].copy(), -8.0, 25.0)
+    assert quick.search_tiers(tiers, -8.0, 25.0) == pytest.approx(gain, abs=0.1)
+    assert quick.total() == pytest.approx(1.0, abs=1e-5)
+    one, two = full.mode(8.0), quick.mode(8.0)
     assert one is not None
-    assert many is not None
-    np.testing.assert_allclose(one, many, atol=2e-3)
+    assert two is not None
+    assert np.hypot(*(one.mean - truth)) < 3
+    np.testing.assert_allclose(two.mean, one.mean, atol=0.4)
+    assert two.mass == pytest.approx(one.mass, abs=0.02)
+    # Blocks with coarse ratios hold about what full ones hold: the masses differ by little in all.
+    assert np.abs(dense(quick).sum(axis=0) - dense(full).sum(axis=0)).sum() < 0.1
+
+
+def test_yaws_unknown_are_averaged_over() -> None:
+    tiers, cover, _ = tiers_of(9, headings=36)
+    log_weight = np.log(np.random.default_rng(1).dirichlet(np.ones(36)))
+    scene = town(9, 700.0, 300)
+    truth = (1385.0, 5315.0)
+    points = view_points(view_at(scene, *truth, 0.9, missed=0.1, rng=np.random.default_rng(9)), 2.5)
+    yaw = np.arange(36) * (2 * math.pi / 36)
+    free = MaskTiers(points, cover, cover.coarser(), 2, 5.0, yaw, RATES, 1.0, log_weight)
+    llr = tiers.fine(all_blocks(cover, 36)).reshape(36, -1, BLOCK, BLOCK).astype(np.float64)
+    expected = np.log((np.exp(llr) * np.exp(log_weight)[:, None, None, None]).sum(axis=0))
+    got = free.fine(np.array([[3, 1, 1], [30, 1, 1], [0, 4, 2]], np.int32))
+    np.testing.assert_allclose(got[0], got[1])
+    np.testing.assert_allclose(got[0], expected[cover.blocks[1] + 1], atol=1e-3)
+    belief = Belief(cover.shape, BeliefSettings(headings=36))
+    belief.search_tiers(free, -8.0, 25.0)
+    whole = dense(belief)
+    np.testing.assert_allclose(whole[0], whole[20], atol=1e-9)
+    assert belief.total() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_unknown_ground_and_unseen_pixels_say_nothing() -> None:
@@ -208,10 +298,10 @@ def test_blank_view_speaks_for_no_place() -> None:
     points = view_points(view_at(town(1, 600.0, 1), 1300, 5300, 0.7), 2.5)
     assert points.rate == 0
     a, b = mask_templates(points, np.array([0.4]), 5.0, RATES)
-    score = next(iter(MapCover(built, np.ones_like(built)).score_all(a, b, np.ones(1, np.bool_))))
-    assert score is not None
+    inner = np.array([[0, 1, 1], [0, 1, 2], [0, 2, 1], [0, 2, 2]], np.int32)
+    score = MapCover(built, np.ones_like(built)).score_blocks(inner, a, b)
     assert score.max() <= 1e-3
-    assert score[32, 32] < -1
+    assert score[3, 0, 0] < -1
 
 
 def test_rings_equal_brute_force() -> None:
