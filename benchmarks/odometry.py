@@ -357,7 +357,11 @@ def main() -> None:
         for line in given.results.read_text(encoding="utf-8").splitlines():
             row = json.loads(line)
             done[row.pop("condition"), row.pop("seed")] = row
-    chosen = [c for c in CONDITIONS if not given.names or c.name in given.names]
+    unknown = set(given.names) - {c.name for c in CONDITIONS}
+    if unknown:
+        sys.exit(f"no such condition: {', '.join(sorted(unknown))}")
+    chosen = sorted(CONDITIONS, key=lambda c: given.names.index(c.name) if c.name in given.names else 99)
+    chosen = [c for c in chosen if not given.names or c.name in given.names]
     # All conditions once, then all of them again: what is stopped early still has every row.
     for seed in range(given.first, given.first + given.seeds):
         for condition in chosen:

@@ -308,6 +308,12 @@ def why(region: str, stage: str, data: Path) -> None:
     help="Draw the frames of a generated REGION as it is on another day of this season: other light, crops and cars.",
 )
 @click.option("--no-odometry", is_flag=True, help="Fly without odometry.")
+@click.option(
+    "--interval",
+    "interval_s",
+    type=click.FloatRange(0.02, 60.0),
+    help="Seconds between frames (default: the region's, 5); 0.1 to 0.5 is what brmgeo odometry follows best.",
+)
 @click.option("--compass", is_flag=True, help="Write a compass heading (3 deg) into frames.csv.")
 def simulate(
     region: str | None,
@@ -323,6 +329,7 @@ def simulate(
     scale_bias: float | None,
     season: str | None,
     no_odometry: bool,
+    interval_s: float | None,
     compass: bool,
 ) -> None:
     """Simulate a flight over REGION: frames, masks, odometry, IMU, altimeter and reference in one folder."""
@@ -338,8 +345,9 @@ def simulate(
         raise SettingsError("simulate --season: needs a generated REGION, and --mode frames or both")
     own, folder, _ = job.maps_for("simulate", region, maps_dir, data, scheduler)
     what = job.Simulation(
-        folder.absolute(), own.flight, path, mode, scale_bias, no_odometry=no_odometry, compass=compass
-    )
+        folder.absolute(), own.flight, path, mode, scale_bias, no_odometry=no_odometry, compass=compass,
+        interval_s=interval_s,
+    )  # fmt: skip
     flights = data / "source" / own.name / "flights"
     with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
         if season is not None:
@@ -387,6 +395,13 @@ def simulate(
     help="Metres per second that bound the movement where there is no odometry (default: the region's, 20).",
 )
 @click.option(
+    "--odometry",
+    type=click.Choice(["auto", "given"]),
+    default="auto",
+    show_default=True,
+    help="auto: made from the frames where the flight has none and they are dense enough; given: only its own.",
+)
+@click.option(
     "--sift", is_flag=True, help="Also match the frames to the imagery by SIFT, the paper's Fig. 1."
 )
 def localize(
@@ -400,6 +415,7 @@ def localize(
     seed: int,
     compass: bool,
     max_speed_m_s: float | None,
+    odometry: str,
     sift: bool,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
@@ -423,6 +439,7 @@ def localize(
         compass=compass,
         sift=sift,
         max_speed_m_s=max_speed_m_s,
+        odometry=odometry,
         attribution=attribution,
     )
 

@@ -52,6 +52,7 @@ from brmgeo.region import FlightSettings, Region
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
 from pipelines.maps import NativeImagery, native_imagery
+from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named
 
 FloatArray = NDArray[np.float64]
@@ -188,10 +189,12 @@ def localize(
     compass: bool = False,
     sift: bool = False,
     max_speed_m_s: float | None = None,
+    odometry: str = "auto",
     attribution: str = "",
 ) -> Path:
     """Locates a flight over built maps and writes all its results into ``out``; returns the report's path.
 
+    A flight without odometry gets its own from its frames, where they are dense enough, unless ``odometry`` is "given".
     ``out`` is replaced as a whole, at the end: a run that fails leaves what was there. ``max_speed_m_s`` bounds the
     movement where odometry says nothing (default: the region's).
     """
@@ -201,6 +204,11 @@ def localize(
     progress = Progress()
     maps = read_maps(maps_dir.absolute())
     flight = read_flight(flight_dir)
+    if odometry == "auto":
+        tried = own_odometry(flight, (flight_settings or FlightSettings()).interval_s)
+        flight = tried.flight
+        if tried.says:
+            progress.say(f"{flight.name} odometry: {tried.says}")
     reference = flight.reference(maps.crs)
     yaws = flight.compass_yaw_rad(maps.crs, *_middle(maps)) if compass else None
     if compass and (yaws is None or all(y is None for y in yaws)):
@@ -325,12 +333,11 @@ def _write_results(
         height_reference="ground",
     )
     scores = None if truth is None else score(estimates, smoothed.xy, steps, truth)
-    odometry = "none" if flight.odometry is None else flight.odometry.source or "odometry"
     names: dict[str, Any] = {
         "flight": flight.name,
         "data": source,
         "method": method,
-        "odometry": f"{source}: {odometry}" if odometry != "none" else odometry,
+        "odometry": odometry_name(flight, source),
         "masks": "masks/ of the flight folder",
         "maps": str(maps.folder),
         "settings": _plain_settings(settings, method),
@@ -600,6 +607,7 @@ class Simulation:
         mode: masks, frames or both.
         scale_bias: of the odometry; None draws it.
         no_odometry, compass: what the aircraft carries.
+        interval_s: seconds between frames; None for the region's.
         imagery: a (h, w, 3) picture by path in place of the maps' own, for flights on another day; None for the maps'.
         native: the region's imagery where that is finer than its maps: frames are drawn from it.
     """
@@ -611,6 +619,7 @@ class Simulation:
     scale_bias: float | None = None
     no_odometry: bool = False
     compass: bool = False
+    interval_s: float | None = None
     imagery: Path | None = None
     native: NativeImagery | None = None
 
@@ -646,6 +655,8 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     changes: dict[str, Any] = {
         "odometry": None if what.no_odometry else OdometryErrors(scale_bias=what.scale_bias)
     }
+    if what.interval_s is not None:
+        changes["frame_interval_s"] = what.interval_s
     if what.compass:
         changes["compass_error_deg"] = 3.0
     settings = simulator_settings(what.own, **changes)

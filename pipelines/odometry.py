@@ -25,9 +25,11 @@ from brmgeo.flight.vio import VioSettings, run_vio
 FloatArray = NDArray[np.float64]
 Method = Literal["auto", "vio", "planar"]
 MADE_BY = "brmgeo odometry"
+MADE_FROM_FRAMES = "made from the frames"
 #: Slower than this, frames do not overlap enough in time for points to be followed between them.
 VIDEO_INTERVAL_S = 0.6
-GRAVITY = 9.80665
+#: So many frames show whether a flight's pictures overlap enough for planar odometry.
+PROBE_FRAMES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +161,63 @@ def estimate(flight: Flight, method: Method = "auto") -> Embedded:
     return made
 
 
+@dataclass(frozen=True, slots=True)
+class OwnOdometry:
+    """What a flight without odometry got from its frames.
+
+    Attributes:
+        flight: with odometry where some could be made, and fewer frames where they came at video rate.
+        says: one line about it; empty where nothing was tried.
+    """
+
+    flight: Flight
+    says: str = ""
+
+
+def own_odometry(flight: Flight, every_s: float) -> OwnOdometry:
+    """The flight with odometry from its own frames, where it has none and the frames are dense enough; else as it is.
+
+    Frames at video rate with an imu.csv go through the visual-inertial filter, and a frame every ``every_s`` seconds is
+    left to be matched. Others are joined by planar odometry, where more than half of the first frames overlap. What
+    ``brmgeo odometry`` would refuse is said and left: the flight then is located without odometry. Nothing is written.
+    """
+    if flight.odometry is not None or not flight.has_images or len(flight.frames) < 3:
+        return OwnOdometry(flight)
+    dense = float(np.median(np.diff(flight.times_s))) <= VIDEO_INTERVAL_S
+    few = replace(flight, frames=flight.frames[:PROBE_FRAMES])
+    try:
+        if flight.imu() is not None and dense:
+            made = estimate(flight, "vio")
+        elif not dense and 2 * (estimate(few, "planar").facts["segments"] - 1) >= len(few.frames) - 1:
+            return OwnOdometry(flight, "none: the frames do not overlap enough to make it from them")
+        else:
+            made = estimate(flight, "planar")
+    except FlightError as error:
+        return OwnOdometry(flight, f"none: it cannot be made from the frames: {error}")
+    facts = made.facts
+    says = (
+        f"{MADE_FROM_FRAMES}: {made.odometry.source}, {facts['length_m']:.0f} m in {facts['seconds']:.0f} s, "
+        f"{facts['blind_frames']} of {facts['poses']} poses blind, {facts['segments']} segment(s)"
+    )
+    kept = thinned_rows(flight.times_s, every_s) if dense else np.arange(len(flight.frames))
+    if len(kept) < len(flight.frames):
+        says += f"; every {every_s:g} s one of its {len(flight.frames)} frames is matched"
+    frames = tuple(flight.frames[int(i)] for i in kept)
+    return OwnOdometry(replace(flight, odometry=replace(made.odometry, source=says), frames=frames), says)
+
+
+def odometry_name(flight: Flight, source: str) -> str:
+    """Where a flight folder's odometry comes from, for reports: ``source`` tells who made the flight."""
+    if flight.odometry is None:
+        return "none"
+    if flight.odometry.source.startswith(MADE_FROM_FRAMES):
+        return flight.odometry.source
+    if _is_ours(flight.folder / "odometry.json"):
+        method = json.loads((flight.folder / "odometry.json").read_text(encoding="utf-8"))["method"]
+        return f"{MADE_FROM_FRAMES} by {MADE_BY}: {method}"
+    return f"{source}: {flight.odometry.source or 'odometry'}"
+
+
 def _warnings(facts: dict[str, Any]) -> list[str]:
     found = []
     delay, sigma = facts["delay_ms"], facts["delay_sigma_ms"]
@@ -237,9 +296,7 @@ def thin_flight(flight_dir: Path, out: Path, every_s: float) -> Path:
         raise InputError(f"{out}: the thinned flight needs a new or empty folder")
     if flight.has_images and not (flight_dir / "frames").is_dir():
         raise InputError(f"{flight_dir}: its frames are a video: list fewer of them in frames.csv")
-    times = flight.times_s
-    slot = np.floor((times - times[0]) / every_s + 1e-6)
-    kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0)
+    kept = thinned_rows(flight.times_s, every_s)
     lines = (flight_dir / "frames.csv").read_text(encoding="utf-8-sig").splitlines()
     rows = [i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     chosen = [lines[rows[0]], *(lines[rows[1 + int(i)]] for i in kept)]
@@ -256,6 +313,12 @@ def thin_flight(flight_dir: Path, out: Path, every_s: float) -> Path:
     _replace(out / "frames.csv", "\n".join(chosen) + "\n")
     read_flight(out)
     return out
+
+
+def thinned_rows(times_s: FloatArray, every_s: float) -> NDArray[np.int64]:
+    """(k,) indices of the first frame in each ``every_s`` seconds."""
+    slot = np.floor((times_s - times_s[0]) / every_s + 1e-6)
+    return np.flatnonzero(np.diff(slot, prepend=-1.0) > 0).astype(np.int64)
 
 
 def _is_ours(path: Path) -> bool:
