@@ -84,26 +84,10 @@ def write_trajectory(
     """
     if len(files) != len(estimates):
         raise ValueError(f"{len(estimates)} estimates, but {len(files)} file names")
-    written = [
-        write_fixes(out_dir / "fixes.csv", estimates, files, crs),
-        write_path_geojson(
-            out_dir / "trajectory.geojson",
-            estimates,
-            crs,
-            start_utc=start_utc,
-            smoothed=smoothed,
-            reference=reference,
-        ),
-        write_path_gpkg(
-            out_dir / "trajectory.gpkg",
-            estimates,
-            files,
-            crs,
-            start_utc=start_utc,
-            smoothed=smoothed,
-            reference=reference,
-        ),
-    ]
+    geojson, gpkg = out_dir / "trajectory.geojson", out_dir / "trajectory.gpkg"
+    written = [write_fixes(out_dir / "fixes.csv", estimates, files, crs)]
+    written.append(write_path_geojson(geojson, estimates, crs, start_utc, smoothed, reference))
+    written.append(write_path_gpkg(gpkg, estimates, files, crs, start_utc, smoothed, reference))
     track, name = (
         (smoothed, "smoothed") if smoothed is not None else (converged_track(estimates, z_m), "online")
     )
@@ -170,7 +154,6 @@ def write_path_geojson(
     path: Path,
     estimates: Sequence[Estimate],
     crs: str,
-    *,
     start_utc: datetime | None = None,
     smoothed: Track | None = None,
     reference: Track | None = None,
@@ -184,6 +167,15 @@ def write_path_geojson(
     return path
 
 
+def _tracks(
+    estimates: Sequence[Estimate], smoothed: Track | None, reference: Track | None
+) -> list[tuple[str, Track, list[slice]]]:
+    # Name, points and unbroken stretches of each path that there is.
+    whole = (("smoothed", smoothed), ("reference", reference))
+    online = ("online", converged_track(estimates), _runs(estimates))
+    return [online, *((name, track, [slice(None)]) for name, track in whole if track is not None)]
+
+
 def _path_features(
     estimates: Sequence[Estimate],
     crs: str,
@@ -192,11 +184,7 @@ def _path_features(
     reference: Track | None,
 ) -> Iterator[str]:
     epsg = epsg_of(crs) or "null"
-    online = converged_track(estimates)
-    tracks: list[tuple[str, Track, list[slice]]] = [("online", online, _runs(estimates))]
-    tracks += [
-        (n, t, [slice(None)]) for n, t in (("smoothed", smoothed), ("reference", reference)) if t is not None
-    ]
+    tracks = _tracks(estimates, smoothed, reference)
     degrees = {name: lonlat(track.xy, crs) for name, track, _ in tracks if len(track.t_s)}
     for name, track, runs in tracks:
         for run in runs:
@@ -230,7 +218,6 @@ def write_path_gpkg(
     estimates: Sequence[Estimate],
     files: Sequence[str],
     crs: str,
-    *,
     start_utc: datetime | None = None,
     smoothed: Track | None = None,
     reference: Track | None = None,
@@ -242,11 +229,7 @@ def write_path_gpkg(
     left out, but ``online`` always is there. The styles make QGIS's temporal controller play the points.
     """
     kept = [i for i, e in enumerate(estimates) if e.position is not None]
-    online = converged_track(estimates)
-    tracks: list[tuple[str, Track, list[slice]]] = [("online", online, _runs(estimates))]
-    tracks += [
-        (n, t, [slice(None)]) for n, t in (("smoothed", smoothed), ("reference", reference)) if t is not None
-    ]
+    tracks = _tracks(estimates, smoothed, reference)
     styles: dict[str, tuple[qgis_style.Style, str]] = {}
     with replacing(path) as scratch:
         for name, track, runs in tracks:
