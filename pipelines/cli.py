@@ -34,6 +34,11 @@ scheduler_option = click.option(
 )
 
 
+weights_option = click.option(
+    "--weights", type=FILE, help="Weights of the network, .onnx or .safetensors (default: those that ship)."
+)
+
+
 class _Numbers(click.ParamType[tuple[float, ...]]):
     """Comma-separated numbers."""
 
@@ -334,6 +339,7 @@ def simulate(
 ) -> None:
     """Simulate a flight over REGION: frames, masks, odometry, IMU, altimeter and reference in one folder."""
     from pipelines import flights as job
+    from pipelines.maps import native_imagery
 
     if out is None and region is None:
         raise SettingsError("simulate --maps: give --out, the flight folder to write")
@@ -354,7 +360,7 @@ def simulate(
             picture = job.other_day(own, folder, season, seed, Path(scratch) / "other-day.tif")
             what = replace(what, imagery=picture)
         elif region is not None and mode != "masks":
-            what = replace(what, native=job.native_imagery(own, data))
+            what = replace(what, native=native_imagery(own, data))
         if count is None:
             name = name or f"simulated-{seed}"
             click.echo(f"wrote {job.simulate_flight(what, seed, out or flights / name, name)}")
@@ -404,6 +410,21 @@ def simulate(
 @click.option(
     "--sift", is_flag=True, help="Also match the frames to the imagery by SIFT, the paper's Fig. 1."
 )
+@click.option(
+    "--masks",
+    "masks",
+    type=click.Choice(["given", "network"]),
+    default="given",
+    show_default=True,
+    help="given: the flight's own masks, and the network's only where it has none; network: always the network's.",
+)
+@weights_option
+@click.option(
+    "--as",
+    "answer",
+    type=click.Choice(["probability", "mask"]),
+    help="What the matcher gets of the network: probabilities, or masks above the threshold.",
+)
 def localize(
     region: str | None,
     data: Path,
@@ -417,9 +438,13 @@ def localize(
     max_speed_m_s: float | None,
     odometry: str,
     sift: bool,
+    masks: str,
+    weights: Path | None,
+    answer: str | None,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
     from pipelines import flights as job
+    from pipelines.masks import NetworkUse
 
     own, folder, attribution = job.maps_for("localize", region, maps_dir, data, scheduler)
     if flight is None:
@@ -430,6 +455,8 @@ def localize(
         if region is None:
             raise SettingsError("localize --maps: give --out, the folder for the results")
         out = data / "out" / own.name / "flights" / job.flight_name(flight) / method
+    cache = data / "work" / "masks" if region is not None else out.absolute().parent / ".brmgeo-masks"
+    use = NetworkUse(masks, weights, answer or NetworkUse().answer, cache)  # type: ignore[arg-type]
     job.localize(
         folder,
         flight,
@@ -440,6 +467,7 @@ def localize(
         sift=sift,
         max_speed_m_s=max_speed_m_s,
         odometry=odometry,
+        network=use,
         attribution=attribution,
     )
 
@@ -475,6 +503,13 @@ def localize(
     help="Hide this half of the map and fly over it: nothing may be found.",
 )
 @click.option(
+    "--masks",
+    "masks",
+    help="Compare masks over the same flights: some of true, network (on rendered frames), degraded (to pixel accuracy "
+    "0.916), simulated; default: simulated alone, on flights without frames.",
+)
+@weights_option
+@click.option(
     "--out", type=DATA, help="Where flights.csv and summary.md go (default data/out/REGION/evaluation)."
 )
 def evaluate(
@@ -489,10 +524,13 @@ def evaluate(
     path: str,
     scale_bias: float,
     hide: str | None,
+    masks: str | None,
+    weights: Path | None,
     out: Path | None,
 ) -> None:
     """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
     from pipelines import flights as job
+    from pipelines.maps import native_imagery
 
     if results:
         click.echo(job.compare_results(results, out))
@@ -508,10 +546,96 @@ def evaluate(
             / "evaluation"
             / (f"hidden-{hide}" if hide else path if path in job.PATHS else "waypoints")
         )
-    chosen = tuple(m.strip() for m in methods.split(",") if m.strip())
-    click.echo(
-        job.evaluate(folder, own.flight, flights, first_seed, chosen, path, scale_bias, hide, out, scheduler)
+        out = out.with_name(f"{out.name}-masks") if masks else out
+    chosen, kinds = (
+        tuple(m.strip() for m in (text or "").split(",") if m.strip()) for text in (methods, masks)
     )
+    compared = None
+    if kinds:
+        compared = job.MaskComparison(kinds, weights, native_imagery(own, data) if region else None)
+    click.echo(
+        job.evaluate(
+            folder, own.flight, flights, first_seed, chosen, path, scale_bias, hide, out, scheduler, compared
+        )
+    )
+
+
+@cli.command()
+@click.argument("source", type=FILE)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Folder for the masks of frames; a .tif for a raster's.",
+)
+@weights_option
+@click.option("--backend", type=click.Choice(["onnx", "torch"]), help="What runs the network (default onnx).")
+@click.option(
+    "--as",
+    "answer",
+    type=click.Choice(["mask", "probability"]),
+    default="mask",
+    show_default=True,
+    help="Masks above the threshold, or probabilities.",
+)
+@click.option("--gsd", "gsd_m", type=float, help="Metres per pixel of the images in a plain folder.")
+@click.option(
+    "--levels", type=_Numbers(2), help="Levels that are black and white, LOW,HIGH, in images of over 8 bits."
+)
+@click.option(
+    "--bands", type=_Numbers(), help="Bands of a raster that are red, green and blue, such as 3,2,1."
+)
+def segment(
+    source: Path,
+    out: Path,
+    weights: Path | None,
+    backend: str | None,
+    answer: str,
+    gsd_m: float | None,
+    levels: tuple[float, ...] | None,
+    bands: tuple[float, ...] | None,
+) -> None:
+    """Find the buildings in SOURCE: a flight folder, a folder of images, or a georeferenced raster of any size."""
+    from pipelines import masks as job
+
+    if bands is not None and any(b != int(b) for b in bands):
+        raise SettingsError(f"segment: --bands {bands} are numbers of bands, from 1")
+    line = job.segment(
+        source,
+        out,
+        weights,
+        backend=backend,
+        answer=answer,  # type: ignore[arg-type]
+        gsd_m=gsd_m,
+        levels=None if levels is None else (levels[0], levels[1]),
+        bands=None if bands is None else tuple(int(b) for b in bands),
+    )
+    click.echo(line)
+
+
+@cli.command("export-onnx")
+@click.argument("weights", type=FILE, required=False)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="The .onnx file to write.")
+@click.option(
+    "--tile",
+    "tile_px",
+    type=click.IntRange(16, 8192),
+    default=512,
+    show_default=True,
+    help="Pixels of a tile: the QGIS plugin Deepness needs one fixed size.",
+)
+@click.option("--any-size", is_flag=True, help="Take pictures of any size, as brmgeo itself runs it.")
+def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -> None:
+    """Write WEIGHTS (.safetensors; default: those that ship) as ONNX for QGIS (Deepness) and other programs."""
+    from brmgeo.segment.onnx_export import export_onnx as export
+    from brmgeo.segment.predict import SHIPPED
+
+    if out.suffix != ".onnx" or not out.absolute().parent.is_dir():
+        raise SettingsError(
+            f"export-onnx --out {out}: give a name that ends in .onnx, in a folder that is there"
+        )
+    card = export(weights or SHIPPED.with_suffix(".safetensors"), out, None if any_size else tile_px)
+    click.echo(f"wrote {out}, weights {card.digest}, {'any size' if any_size else f'{tile_px} px tiles'}")
 
 
 @cli.command("import")

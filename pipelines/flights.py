@@ -49,9 +49,19 @@ from brmgeo.match import (
     make_matcher,
 )
 from brmgeo.region import FlightSettings, Region
+from brmgeo.segment.predict import SHIPPED
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
 from pipelines.maps import NativeImagery, native_imagery
+from pipelines.masks import (
+    FrameMasks,
+    NetworkUse,
+    frame_masks,
+    network_mask,
+    network_name,
+    photographed,
+    slant_gsd_m,
+)
 from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named
 
@@ -158,16 +168,11 @@ def thinned(estimate: Estimate) -> Estimate:
     )
 
 
-def view_at(flight: Flight, gsd_m: float, index: int) -> View:
-    """The levelled view of one frame's mask; InputError where the flight has no masks."""
-    if not flight.has_masks:
-        raise InputError(
-            f"{flight.folder}: the frames have no building masks and this release has no network to make them; "
-            "put one mask a frame into masks/ (0 = other, 255 = building)"
-        )
+def view_at(flight: Flight, gsd_m: float, index: int, masks: FrameMasks | None = None) -> View:
+    """The levelled view of one frame's mask, of the flight's own where no others are given."""
     frame = flight.frames[index]
     return make_view(
-        flight.mask(index),
+        flight.mask(index) if masks is None else masks.image(index),
         flight.camera,
         flight.mount,
         frame.roll_rad,
@@ -189,6 +194,7 @@ def localize(
     compass: bool = False,
     sift: bool = False,
     max_speed_m_s: float | None = None,
+    network: NetworkUse | None = None,
     odometry: str = "auto",
     attribution: str = "",
 ) -> Path:
@@ -196,7 +202,8 @@ def localize(
 
     A flight without odometry gets its own from its frames, where they are dense enough, unless ``odometry`` is "given".
     ``out`` is replaced as a whole, at the end: a run that fails leaves what was there. ``max_speed_m_s`` bounds the
-    movement where odometry says nothing (default: the region's).
+    movement where odometry says nothing (default: the region's). ``network`` says where masks come from (default: the
+    flight's own where it has some, else the network that ships with brmgeo).
     """
     if method not in METHODS:
         raise SettingsError(f"METHOD {method!r} is not known: choose one of {', '.join(METHODS)}")
@@ -220,17 +227,20 @@ def localize(
         own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
     settings = match_settings(own)
     steps = motions_of(flight, yaws)
-    with progress.stage(f"{flight.name} {method}") as bar:
-        views = bar.watch(serial_map)(
-            functools.partial(view_at, flight, maps.ground.gsd_m), range(len(flight.frames))
-        )
-        located = locate(maps.ground, views, steps, method, settings)
-    truth = None if reference is None else reference.at(flight.times_s)
     source = _source_of(flight)
-    with _whole_folder(out) as scratch:
-        _write_results(
-            scratch, out, maps, flight, located, steps, truth, method, settings, source, sift, attribution
-        )
+    with frame_masks(
+        flight, f"{source}: masks/ of the flight folder", network or NetworkUse(), progress
+    ) as masks:
+        with progress.stage(f"{flight.name} {method}") as bar:
+            views = bar.watch(serial_map)(
+                functools.partial(view_at, flight, maps.ground.gsd_m, masks=masks), range(len(flight.frames))
+            )
+            located = locate(maps.ground, views, steps, method, settings)
+        truth = None if reference is None else reference.at(flight.times_s)
+        with _whole_folder(out) as scratch:
+            _write_results(
+                scratch, out, maps, masks, located, steps, truth, method, settings, source, sift, attribution
+            )
     report = out / "report.html"
     progress.say(f"{flight.name} by {method}: {_sentence(located, truth, steps)}; report: {report}")
     return report
@@ -295,7 +305,7 @@ def _write_results(
     folder: Path,
     final: Path,
     maps: Maps,
-    flight: Flight,
+    masks: FrameMasks,
     located: Located,
     steps: Sequence[Motion],
     truth: FloatArray | None,
@@ -309,6 +319,7 @@ def _write_results(
     from brmgeo.export.qgis import write_flight_project
     from brmgeo.export.trajectory import Track, write_trajectory
 
+    flight = masks.flight
     estimates, smoothed, times = located.estimates, located.smoothed, flight.times_s
     files = [frame.file for frame in flight.frames]
     known = np.isfinite(smoothed.xy).all(axis=1)
@@ -338,7 +349,7 @@ def _write_results(
         "data": source,
         "method": method,
         "odometry": odometry_name(flight, source),
-        "masks": "masks/ of the flight folder",
+        "masks": masks.source,
         "maps": str(maps.folder),
         "settings": _plain_settings(settings, method),
     }
@@ -359,7 +370,7 @@ def _write_results(
     tables = []
     if sift and maps.imagery is not None and flight.has_images:
         tables.append(sift_table(maps, flight, truth))
-    figures = _figures(maps, flight, estimates, smoothed, steps, truth)
+    figures = _figures(maps, masks, estimates, smoothed, steps, truth)
     fixes = (folder / "fixes.csv").read_text(encoding="utf-8").splitlines()
     text = render_report(
         title=f"{flight.name}, {method}",
@@ -373,7 +384,8 @@ def _write_results(
             "fixes", tuple(fixes[0].split(",")), tuple(tuple(line.split(",")) for line in fixes[1:])
         ),
         sources=[
-            ("flight", f"{flight.name} ({source}), {len(estimates)} frames, {'masks of the flight folder'}"),
+            ("flight", f"{flight.name} ({source}), {len(estimates)} frames"),
+            ("masks", masks.source),
             ("odometry", names["odometry"]),
             ("height", f"{agl.min():.1f} to {agl.max():.1f} m above ground"),
             ("maps", f"{maps.folder} ({maps.crs}, {maps.ground.gsd_m:g} m per pixel)"),
@@ -399,7 +411,7 @@ def _plain_settings(settings: MatchSettings, method: str) -> dict[str, Any]:
 
 def _figures(
     maps: Maps,
-    flight: Flight,
+    masks: FrameMasks,
     estimates: list[Estimate],
     smoothed: SmoothedPath,
     steps: Sequence[Motion],
@@ -434,7 +446,7 @@ def _figures(
             "What the camera saw",
             "Some frames, the building mask of each as the matcher gets it (levelled, nose up, grey where nothing is "
             "known), and the building map at the online fix, turned alike, with the mask's outlines on it.",
-            seen_figure(_seen(maps, flight, estimates)),
+            seen_figure(_seen(maps, masks, estimates)),
             "image/png",
         ),
         ReportFigure(
@@ -453,14 +465,15 @@ def _figures(
     ]
 
 
-def _seen(maps: Maps, flight: Flight, estimates: Sequence[Estimate]) -> list[Seen]:
+def _seen(maps: Maps, masks: FrameMasks, estimates: Sequence[Estimate]) -> list[Seen]:
     """Four frames: spread over the fixes, or over the flight where there is none."""
+    flight = masks.flight
     fixed = [i for i, e in enumerate(estimates) if e.status == "converged"]
     pool = np.array(fixed or range(len(estimates)))
     chosen = pool[np.unique(np.linspace(0, len(pool) - 1, min(4, len(pool))).round().astype(int))]
     out = []
     for i in chosen.tolist():
-        view, estimate = view_at(flight, maps.ground.gsd_m, i), estimates[i]
+        view, estimate = view_at(flight, maps.ground.gsd_m, i, masks), estimates[i]
         at_fix = estimate.status == "converged" and math.isfinite(estimate.yaw_rad)
         out.append(
             Seen(
@@ -645,7 +658,7 @@ def check_simulation(what: Simulation) -> None:
 
 def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     """Writes a flight folder over built maps, in place of an earlier one; returns it."""
-    from brmgeo.synth.flight import Imagery, OdometryErrors, simulate
+    from brmgeo.synth.flight import OdometryErrors, simulate
 
     _may_replace(out, "flight.toml", "a flight")
     check_simulation(what)
@@ -661,15 +674,9 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
         changes["compass_error_deg"] = 3.0
     settings = simulator_settings(what.own, **changes)
     route = flight_path(what.path, ground, seed, maps.bounds, maps.crs)
-    file, imagery = what.imagery_file(), None
-    if file is not None and what.imagery is None and what.native is not None:
-        reach = what.own.agl_m * math.tan(math.radians(what.own.fov_deg) / 2) * 2.5 + 60.0
-        (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
-        imagery = Imagery(*what.native.around((left, bottom, right, top)), what.native.gsd_m)
-    elif file is not None:
-        box = box_of(file)
-        left, _, _, top = bounds_of(box)
-        imagery = Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
+    file = what.imagery_file()
+    native = what.native if what.imagery is None else None
+    imagery = None if file is None else _imagery_of(what.own, route, native, file)
     with _whole_folder(out) as scratch:
         simulate(
             scratch,
@@ -683,6 +690,19 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
             name=name,
         )
     return out
+
+
+def _imagery_of(own: FlightSettings, route: FloatArray, native: NativeImagery | None, file: Path) -> Any:
+    """What frames along a route are drawn from: the finer imagery where there is some, else a whole picture's file."""
+    from brmgeo.synth.flight import Imagery
+
+    if native is not None:
+        reach = own.agl_m * math.tan(math.radians(own.fov_deg) / 2) * 2.5 + 60.0
+        (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
+        return Imagery(*native.around((left, bottom, right, top)), native.gsd_m)
+    box = box_of(file)
+    left, _, _, top = bounds_of(box)
+    return Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
 
 
 def _simulate_one(job: tuple[Simulation, int, Path, str]) -> Path:
@@ -724,9 +744,32 @@ def other_day(own: Region, maps_dir: Path, season: str, seed: int, out: Path) ->
 # --- many flights, side by side --------------------------------------------------------------------------------
 
 
+MASKS = ("true", "network", "degraded", "simulated")
+PAPER_ACCURACY = 0.916
+
+
+@dataclass(frozen=True, slots=True)
+class MaskComparison:
+    """The same flights with several kinds of masks.
+
+    Attributes:
+        kinds: ``true`` (what a perfect network sees in the frame), ``network`` (on rendered frames), ``degraded`` (the true
+            ones at the pixel accuracy of the paper's network), ``simulated`` (the simulator's own errors).
+        weights: of the network; None for those that ship.
+        native: imagery finer than the maps', to render frames from.
+    """
+
+    kinds: tuple[str, ...]
+    weights: Path | None = None
+    native: NativeImagery | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One simulated masks-only flight of an evaluation; ``hide`` hides half of the map under the flight."""
+    """One simulated flight of an evaluation; ``hide`` hides half of the map under the flight.
+
+    ``masks`` flies it with several kinds of masks; None with the simulator's alone, without frames.
+    """
 
     maps_dir: Path
     own: FlightSettings
@@ -735,6 +778,7 @@ class Trial:
     path: str
     scale_bias: float
     hide: str | None
+    masks: MaskComparison | None = None
 
 
 def fly_trial(trial: Trial) -> list[FlightRow]:
@@ -750,22 +794,72 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
     sign = 1.0 if trial.seed % 2 else -1.0
     settings = simulator_settings(trial.own, odometry=OdometryErrors(scale_bias=sign * trial.scale_bias))
     route = flight_path(trial.path, ground, trial.seed, bounds, maps.crs)
-    flown = simulate_views(ground, route, settings, trial.seed, maps.ground.gsd_m)
+    # Frames show roofs where their height puts them, and so do the masks that are compared with the network's.
+    relief = trial.masks is not None
+    flown = simulate_views(ground, route, settings, trial.seed, maps.ground.gsd_m, relief=relief)
     truth = flown.reference.at(np.array([v.t_s for v in flown.views]))
+    seen = {"": flown.views}
+    if trial.masks is not None:
+        seen = _views_by_masks(trial, trial.masks, maps, ground, route, settings, flown.views)
     rows = []
     for method in trial.methods:
-        located = locate(known, flown.views, flown.motions, method, match_settings(trial.own))
-        rows.append(
-            FlightRow(
-                flight=f"{trial.path}-{trial.seed}",
-                seed=trial.seed,
-                method=method,
-                scores=score(located.estimates, located.smoothed.xy, flown.motions, truth),
-                seconds_per_frame=float(located.seconds.mean()),
-                first_frame_s=float(located.seconds[0]),
+        for kind, views in seen.items():
+            located = locate(known, views, flown.motions, method, match_settings(trial.own))
+            rows.append(
+                FlightRow(
+                    flight=f"{trial.path}-{trial.seed}",
+                    seed=trial.seed,
+                    method=f"{method}, {kind} masks" if kind else method,
+                    scores=score(located.estimates, located.smoothed.xy, flown.motions, truth),
+                    seconds_per_frame=float(located.seconds.mean()),
+                    first_frame_s=float(located.seconds[0]),
+                )
             )
-        )
     return rows
+
+
+def _views_by_masks(
+    trial: Trial,
+    masks: MaskComparison,
+    maps: Maps,
+    ground: Any,
+    route: FloatArray,
+    settings: Any,
+    simulated: list[View],
+) -> dict[str, list[View]]:
+    """The views of one flight by kind of mask: the same course, the same readings, only the masks differ."""
+    from brmgeo.synth.flight import MaskErrors, Simulator, fly
+
+    course = fly(route, settings, trial.seed)
+    frames = range(len(course.frame_index))
+    errors = {"true": MaskErrors.none(), "degraded": MaskErrors.degraded(PAPER_ACCURACY)}
+    seen = {}
+    for kind in masks.kinds:
+        own = replace(settings, masks=errors.get(kind, settings.masks))
+        simulator = Simulator(ground, own, course, trial.seed)
+        if kind == "simulated":
+            seen[kind] = simulated
+            continue
+        if kind == "network":
+            imagery = _imagery_of(trial.own, route, masks.native, maps.imagery or maps.folder / "imagery.tif")
+            images = (
+                network_mask(
+                    photographed(simulator.picture(i, imagery), settings.jpeg_quality),
+                    slant_gsd_m(
+                        settings.camera,
+                        settings.mount,
+                        math.radians(course.measured_roll_deg[i]),
+                        math.radians(course.measured_pitch_deg[i]),
+                        float(course.measured_agl_m[i]),
+                    ),
+                    masks.weights,
+                )
+                for i in frames
+            )
+        else:
+            images = (simulator.mask(i, relief=True) for i in frames)
+        seen[kind] = [simulator.view(i, image, maps.ground.gsd_m) for i, image in zip(frames, images)]
+    return seen
 
 
 def _trial_or_why(trial: Trial) -> list[FlightRow] | str:
@@ -805,8 +899,11 @@ def evaluate(
     hide: str | None,
     out: Path,
     scheduler_spec: str | None,
+    masks: MaskComparison | None = None,
 ) -> str:
     """Flies many simulated flights, writes flights.csv (as they land), summary.md and returns the table as text.
+
+    With ``masks`` each flight is flown with several kinds of masks.
 
     WorkflowError, after all is written, where a flight broke off.
     """
@@ -815,9 +912,27 @@ def evaluate(
             raise SettingsError(f"method {method!r} is not known: choose among {', '.join(METHODS)}")
     if flights < 1:
         raise SettingsError(f"--flights {flights}: give 1 or more")
+    for kind in masks.kinds if masks is not None else ():
+        if kind not in MASKS:
+            raise SettingsError(f"--masks: {kind!r} is not known: choose among {', '.join(MASKS)}")
     maps = read_maps(maps_dir.absolute())
+    drawn = "12 % of buildings missed, 3 false blobs a frame, wobbly edges"
+    shown = f"masks: {drawn}"
+    if masks is not None:
+        told = {
+            "true": "what a perfect network would see in the frame",
+            "degraded": f"true ones with pixels flipped in patches to an accuracy of {PAPER_ACCURACY}",
+            "simulated": drawn,
+        }
+        if "network" in masks.kinds:
+            if maps.imagery is None and masks.native is None:
+                raise MissingInputError(
+                    f"{maps.folder / 'imagery.tif'} is not there; the network's frames are drawn from imagery"
+                )
+            told["network"] = f"{network_name(masks.weights)} on rendered frames"
+        shown = "masks: " + "; ".join(f"{kind}: {told[kind]}" for kind in masks.kinds)
     trials = [
-        Trial(maps.folder, own, seed, methods, path, scale_bias, hide)
+        Trial(maps.folder, own, seed, methods, path, scale_bias, hide, masks)
         for seed in range(first_seed, first_seed + flights)
     ]
     progress = Progress()
@@ -835,10 +950,10 @@ def evaluate(
         raise WorkflowError(f"evaluate: none of {flights} flights could be flown; {broken[0]}")
     where = "over ground that the map does not show" if hide else "over built-up ground"
     note = (
-        f"{flights - len(broken)} simulated masks-only flights ({path}, seeds {first_seed} to "
+        f"{flights - len(broken)} simulated {'masks-only ' if masks is None else ''}flights ({path}, seeds {first_seed} to "
         f"{first_seed + flights - 1}) {where} of {maps.folder.name}; "
         f"odometry: simulated, scale bias {scale_bias:+.0%} or the opposite, heading drift 0.75 deg per root minute; "
-        "masks: 12 % of buildings missed, 3 false blobs a frame, wobbly edges. Nothing is aligned before it is scored."
+        f"{shown}. Nothing is aligned before it is scored."
     )
     if broken:
         note += (
@@ -921,11 +1036,15 @@ def maps_for(
 
 
 def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
-    """The flight that is simulated when none is given: the paper's rectangle, frames and masks; made once a seed."""
+    """The flight that is simulated when none is given: the paper's rectangle, made once a seed.
+
+    Frames, for the network to make masks of, where the maps have imagery; else masks.
+    """
     name = f"simulated-{seed}"
     out = data / "source" / own.name / "flights" / name
     maps = read_maps(maps_dir.absolute())
-    mode = "both" if maps.imagery is not None else "masks"
+    pictures = "frames" if SHIPPED.is_file() else "both"
+    mode = pictures if maps.imagery is not None else "masks"
     recipe = json.dumps(
         {
             "seed": seed,
@@ -938,7 +1057,7 @@ def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
     note = out / ".recipe.json"
     if not note.is_file() or note.read_text(encoding="utf-8") != recipe:
         Progress().say(f"{name}: simulating the paper's rectangle over {own.name} (seed {seed})")
-        native = native_imagery(own, data) if mode == "both" else None
+        native = native_imagery(own, data) if mode != "masks" else None
         simulate_flight(Simulation(maps.folder, own.flight, mode=mode, native=native), seed, out, name)
         note.write_text(recipe, encoding="utf-8")
     return out

@@ -331,7 +331,8 @@ class Segmenter:
                 f"{card.gsd_min_m:g} to {card.gsd_max_m:g} m"
             )
         square = max(down, across) <= 1.1 * min(down, across)
-        if square and card.gsd_min_m <= down <= card.gsd_max_m:
+        # A raster's metres are its projection's, a frame's height is measured: a few percent are no other scale.
+        if square and card.gsd_min_m / 1.05 <= down <= card.gsd_max_m * 1.05:
             return shape
         mean = math.sqrt(down * across)
         work = card.gsd_work_m or min(max(mean, card.gsd_min_m), card.gsd_max_m)

@@ -421,17 +421,6 @@ def test_bad_flights_are_refused_in_one_line_and_the_old_results_stay(
     assert {p.name for p in tmp_path.iterdir()} == {"out", "flight"}
 
 
-def test_frames_without_masks_need_masks(
-    maps: Path, waypoints: Path, tmp_path: Path, say: Callable[..., Said]
-) -> None:
-    flight = make_flight(maps, waypoints, tmp_path / "f", "--mode", "frames")
-    assert (
-        "no building masks"
-        in say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "o").line
-    )
-    assert not (tmp_path / "o").exists()
-
-
 def test_commands_refuse_what_cannot_be(
     maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], waypoints: Path
 ) -> None:

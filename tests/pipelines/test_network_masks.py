@@ -1,0 +1,450 @@
+"""The network in the loop: masks of frames by content, rasters in windows, through the command line.
+
+The network here is one convolution that calls what is bright building (tests/segment/small_networks.py), and the pictures'
+buildings are bright: what comes out can be worked out by hand.
+"""
+
+# ruff: noqa: F401, F811 (fixtures of another file)
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from rasterio.enums import ColorInterp
+
+from brmgeo.segment.predict import Segmenter
+from pipelines import masks as job
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "segment"))
+from small_networks import bright_onnx, small_card
+from test_flights import CRS, Said, bytes_of, make_flight, maps, say, waypoints
+
+Say = Callable[..., Said]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    card = small_card(
+        mean=(0.52, 0.52, 0.52), std=(0.05, 0.05, 0.05), threshold=0.5, temperature=1.0, gsd_min_m=0.05,
+        gsd_max_m=1.0, gsd_work_m=None, sha256="ab" * 32,
+    )  # fmt: skip
+    return bright_onnx(tmp_path_factory.mktemp("net") / "bright.onnx", card)
+
+
+@pytest.fixture(scope="module")
+def pictured(maps: Path, waypoints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flight of test_flights.py with frames in place of masks; never change it."""
+    out = tmp_path_factory.mktemp("pictured") / "f"
+    return make_flight(maps, waypoints, out, "--mode", "frames", "--scale-bias", 0.03)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The shape of every picture that a network has been asked about."""
+    seen: list[tuple[int, ...]] = []
+    own = Segmenter.probabilities
+
+    def counted(self: Segmenter, images: list, gsds: list) -> list:
+        seen.extend(i.rgb.shape for i in images)
+        return own(self, images, gsds)
+
+    monkeypatch.setattr(Segmenter, "probabilities", counted)
+    return seen
+
+
+# ---------------------------------------------------------------- localize
+
+
+def frames_of(flight: Path) -> list[str]:
+    return [frame.file for frame in job.read_flight(flight).frames]
+
+
+def test_localize_runs_the_network_where_there_are_no_masks(
+    maps: Path, pictured: Path, weights: Path, tmp_path: Path, say: Say, asked: list
+) -> None:
+    before = bytes_of(pictured)
+    words = ["localize", "--maps", maps, "--flight", pictured, "--weights", weights, "--out", tmp_path / "a"]
+    said = say(*words)
+    assert said.code == 0, said.err
+    frames = len(frames_of(pictured))
+    assert asked == [(480, 640, 3)] * frames
+    assert bytes_of(pictured) == before
+    metrics = json.loads((tmp_path / "a/metrics.json").read_text())
+    assert metrics["masks"].startswith("network bright abababababab (ONNX Runtime), ")
+    assert metrics["data"] == "simulated"
+    assert metrics["false_fixes"] == 0
+    assert metrics["rmse_after_first_fix_m"] < 5
+    assert "network bright abababababab" in (tmp_path / "a/report.html").read_text()
+    assert len([p for p in (tmp_path / ".brmgeo-masks").rglob("*") if p.is_file()]) == frames
+    fixes = (tmp_path / "a/fixes.csv").read_bytes()
+    said = say(*words)
+    assert len(asked) == frames
+    assert f"{frames} of {frames} frames were known" in said.err
+    assert (tmp_path / "a/fixes.csv").read_bytes() == fixes
+
+
+def test_the_network_is_asked_only_of_what_it_has_not_seen(
+    pictured: Path, weights: Path, tmp_path: Path, asked: list
+) -> None:
+    cache = tmp_path / "cache"
+
+    def ask(folder: Path, weights_file: Path) -> list[bytes]:
+        asked.clear()
+        flight = job.read_flight(folder)
+        use = job.NetworkUse(weights=weights_file, cache=cache)
+        with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
+            return [masks.image(i).tobytes() for i in range(len(flight.frames))]
+
+    first = ask(pictured, weights)
+    assert len(asked) == len(first)
+    assert ask(pictured, weights) == first
+    assert not asked
+    sorted(p for p in cache.rglob("*") if p.is_file())[0].write_bytes(b"damaged")
+    assert ask(pictured, weights) == first
+    assert len(asked) == 1
+    flight = Path(shutil.copytree(pictured, tmp_path / "f"))
+    frame = flight / "frames" / frames_of(flight)[3]
+    cv2.imwrite(str(frame), cv2.imread(str(frame))[::-1])
+    changed = ask(flight, weights)
+    assert [a == b for a, b in zip(changed, first, strict=True)] == [i != 3 for i in range(len(first))]
+    assert len(asked) == 1
+    text = (flight / "flight.toml").read_text()
+    (flight / "flight.toml").write_text(
+        text.replace('source = "frames"', 'source = "fixed"\nfixed_m = 1500.0')
+    )
+    ask(flight, weights)
+    assert len(asked) == len(first), "from another height the frames are resampled"
+    ask(pictured, bright_onnx(tmp_path / "other.onnx", small_card(sha256="cd" * 32)))
+    assert len(asked) == len(first)
+
+
+@pytest.mark.parametrize("answer", ["mask", "probability"])
+def test_masks_are_what_the_network_says(pictured: Path, weights: Path, answer: job.Answer) -> None:
+    flight = job.read_flight(pictured)
+    segmenter = Segmenter.load(weights)
+    use = job.NetworkUse(weights=weights, answer=answer)
+    with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
+        image = masks.image(2)
+        wanted = segmenter.probability(flight.image(2), job.frame_gsd_m(flight, 2))
+        if answer == "probability":
+            assert image.dtype == np.float32
+            np.testing.assert_allclose(image, wanted, atol=0.5 / job.STEPS + 1e-6)
+        else:
+            apart = (image > 0) != (wanted > 0.5)
+            assert (np.abs(wanted[apart] - 0.5) < 1 / job.STEPS).all()
+            assert set(np.unique(image)) == {0, 255}
+        files = masks.files
+    assert files is not None
+    assert not files[0].exists(), "without a cache nothing is left behind"
+
+
+def test_given_masks_are_used_unless_the_network_is_wanted(
+    maps: Path, waypoints: Path, weights: Path, tmp_path: Path, say: Say, asked: list
+) -> None:
+    folder = make_flight(maps, waypoints, tmp_path / "f", "--mode", "both")
+    flight, quiet = job.read_flight(folder), job.Progress(quiet=True)
+    with job.frame_masks(flight, "as given", job.NetworkUse(), quiet) as masks:
+        assert masks.source == "as given"
+        assert (masks.image(1) == flight.mask(1)).all()
+    assert not asked
+    for use in (job.NetworkUse(weights=weights), job.NetworkUse(wanted="network", weights=weights)):
+        asked.clear()
+        with job.frame_masks(flight, "as given", use, quiet) as masks:
+            assert masks.source.startswith("network bright")
+        assert len(asked) == len(flight.frames)
+    shutil.rmtree(folder / "frames")
+    words = ("localize", "--maps", maps, "--flight", folder, "--out", tmp_path / "out")
+    assert "has no frames" in say(*words, "--weights", weights).line
+    assert "has no frames" in say(*words, "--masks", "network").line
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f: f.write_bytes(f.read_bytes()[:9000]), "cut short"),
+        (lambda f: cv2.imwrite(str(f), np.zeros((480, 641, 3), np.uint8)), "641 x 480"),
+    ],
+)
+def test_damaged_frames_are_refused_in_one_line(
+    maps: Path,
+    pictured: Path,
+    weights: Path,
+    tmp_path: Path,
+    say: Say,
+    spoil: Callable[[Path], object],
+    words: str,
+) -> None:
+    flight = Path(shutil.copytree(pictured, tmp_path / "f"))
+    frame = sorted((flight / "frames").iterdir())[1]
+    spoil(frame)
+    said = say(
+        "localize", "--maps", maps, "--flight", flight, "--weights", weights, "--out", tmp_path / "out"
+    )
+    assert words in said.line
+    assert frame.name in said.line
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_weights_are_refused_before_anything_is_done(
+    maps: Path,
+    pictured: Path,
+    weights: Path,
+    tmp_path: Path,
+    say: Say,
+) -> None:
+    bad = tmp_path / "bad.onnx"
+    bad.write_bytes(weights.read_bytes()[:-1])
+    words = ("localize", "--maps", maps, "--flight", pictured, "--out", tmp_path / "out", "--weights")
+    assert "SHA-256 differs" in say(*words, bad).line
+    assert "no such weights" in say(*words, tmp_path / "none.safetensors").line
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_flights_with_several_kinds_of_masks(
+    maps: Path, waypoints: Path, weights: Path, tmp_path: Path, say: Say
+) -> None:
+    words = ("evaluate", "--maps", maps, "--out", tmp_path, "--flights", 1, "--path", waypoints)
+    said = say(*words, "--methods", "mask", "--masks", "true,network,degraded", "--weights", weights)
+    assert said.code == 0, said.err
+    rows = list(csv.DictReader((tmp_path / "flights.csv").read_text().splitlines()))
+    by = {r["method"]: r for r in rows}
+    assert len(rows) == 3
+    assert set(by) == {f"mask, {kind} masks" for kind in ("true", "network", "degraded")}
+    assert len({r["odometry_rmse_m"] for r in rows}) == 1
+    assert all(int(r["false_fixes"]) == 0 for r in rows)
+    assert float(by["mask, network masks"]["rmse_after_first_fix_m"]) < 3
+    text = (tmp_path / "summary.md").read_text()
+    assert "network bright abababababab on rendered frames" in text
+    assert "accuracy of 0.916" in text
+    assert "'perfect' is not known" in say(*words, "--masks", "perfect").line
+
+
+# ---------------------------------------------------------------- folders of images
+
+
+def test_segment_a_flight_and_a_folder(
+    pictured: Path,
+    weights: Path,
+    tmp_path: Path,
+    say: Say,
+) -> None:
+    said = say("segment", pictured, "--out", tmp_path / "masks", "--weights", weights)
+    assert said.code == 0, said.err
+    flight = job.read_flight(pictured)
+    facts = json.loads((tmp_path / "masks" / job.SIGN).read_text())
+    assert facts["images"] == len(flight.frames)
+    assert facts["weights"] == "ab" * 32
+    # They are masks by the letter of docs/FLIGHT.md.
+    given = Path(shutil.copytree(pictured, tmp_path / "given"))
+    shutil.copytree(tmp_path / "masks", given / "masks")
+    again = job.read_flight(given)
+    segmenter = Segmenter.load(weights)
+    assert (again.mask(1) == segmenter.mask(flight.image(1), job.frame_gsd_m(flight, 1))).all()
+
+    folder = tmp_path / "images"
+    folder.mkdir()
+    rgba = np.full((40, 60, 4), 255, np.uint8)
+    rgba[:, :30, 3] = 0
+    cv2.imwrite(str(folder / "a.png"), rgba)
+    cv2.imwrite(str(folder / "b.jpg"), np.zeros((33, 47), np.uint8))
+    words = ("segment", folder, "--weights", weights, "--gsd", 0.3, "--out", tmp_path / "p")
+    assert say(*words, "--as", "probability").code == 0
+    a, b = (cv2.imread(str(tmp_path / "p" / n), cv2.IMREAD_UNCHANGED) for n in ("a.png", "b.png"))
+    assert (a[:, :30] == 255).all()
+    assert (a[5:-5, 35:-5] == 254).all()
+    assert b.shape == (33, 47)
+    assert (b == 0).all()
+    (folder / "a.tif").write_bytes((folder / "a.png").read_bytes())
+    assert "differ only in their ending" in say(*words).line
+    (folder / "a.tif").unlink()
+    assert "other files" in say(*words[:-1], folder).line
+    (tmp_path / "none").mkdir()
+    assert (
+        "no images" in say("segment", tmp_path / "none", "--weights", weights, "--out", tmp_path / "q").line
+    )
+    assert "--gsd goes with" in say("segment", pictured, *words[2:]).line
+
+
+# ---------------------------------------------------------------- rasters
+
+
+def write_raster(path: Path, image: np.ndarray, gsd: float = 0.5, **changes: object) -> Path:
+    bands = np.moveaxis(image, -1, 0)
+    profile = {
+        "driver": "GTiff", "count": len(bands), "height": bands.shape[1], "width": bands.shape[2],
+        "dtype": bands.dtype, "crs": CRS, "transform": Affine(gsd, 0, 195_000, 0, -gsd, 446_000),
+    }  # fmt: skip
+    with rasterio.open(path, "w", **{**profile, **changes}) as dst:
+        dst.write(bands)
+    return path
+
+
+def town(rows: int, cols: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    image = np.full((rows, cols, 3), 60, np.uint8)
+    for _ in range(rows * cols // 900):
+        r, c = rng.integers(0, rows - 12), rng.integers(0, cols - 20)
+        image[r : r + rng.integers(6, 12), c : c + rng.integers(8, 20)] = 200
+    return image
+
+
+def test_a_raster_in_windows_is_as_the_whole(
+    weights: Path,
+    tmp_path: Path,
+    say: Say,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    image = town(700, 1300)
+    raster = write_raster(tmp_path / "in.tif", image)
+    whole = Segmenter.load(weights).probability(image)
+    monkeypatch.setattr(job, "WINDOW_PX", 256)
+    monkeypatch.setattr(job, "OVERLAP_PX", 64)
+    words = ("segment", raster, "--weights", weights, "--out")
+    said = say(*words, tmp_path / "p.tif", "--as", "probability")
+    assert said.code == 0, said.err
+    assert "1300 x 700 px of 0.5 m" in said.out
+    with rasterio.open(tmp_path / "p.tif") as src:
+        assert (src.transform, src.crs, src.shape) == (
+            Affine(0.5, 0, 195_000, 0, -0.5, 446_000),
+            CRS,
+            (700, 1300),
+        )
+        assert src.scales == (1e-4,)
+        assert src.descriptions == ("probability of building",)
+        assert src.tags()["WEIGHTS_SHA256"] == "ab" * 32
+        got = src.read(1) * 1e-4
+    # At the picture's own border the network sees its padding, which depends on the window's size.
+    apart = np.abs(got - whole)[3:-3, 3:-3]
+    assert apart.max() < 0.05
+    assert (apart > 6e-5).mean() < 0.02, "windows differ from the whole only where they meet"
+    assert say(*words, tmp_path / "m.tif").code == 0
+    with rasterio.open(tmp_path / "m.tif") as src:
+        mask = src.read(1)
+    assert ((mask > 0) == (got > 0.5)).mean() > 0.9999
+    assert (mask[5:-5, 5:-5] == (image[5:-5, 5:-5, 0] > 100)).mean() > 0.9
+
+
+def test_unknown_ground_stays_unknown(weights: Path, tmp_path: Path, say: Say) -> None:
+    image = town(120, 150)
+    alpha = np.full((120, 150, 1), 255, np.uint8)
+    alpha[:40] = 0
+    write_raster(
+        tmp_path / "rgba.tif", np.concatenate([image, alpha], axis=2), photometric="RGB", alpha="yes"
+    )
+    image[:40] = 0
+    write_raster(tmp_path / "nodata.tif", image, nodata=0)
+    for name in ("rgba", "nodata"):
+        out = tmp_path / f"{name}-mask.tif"
+        assert say("segment", tmp_path / f"{name}.tif", "--weights", weights, "--out", out).code == 0
+        with rasterio.open(out) as src:
+            mask = src.read(1)
+        assert ((mask == 255) == (np.arange(120) < 40)[:, None]).all(), name
+
+
+@pytest.mark.parametrize(("gsd", "size"), [(0.02, (120, 160)), (2.0, (600, 800)), (0.9, (300, 400))])
+def test_other_scales_are_answered_at_one_the_network_knows(
+    weights: Path,
+    tmp_path: Path,
+    say: Say,
+    gsd: float,
+    size: tuple[int, int],
+) -> None:
+    raster = write_raster(tmp_path / "in.tif", town(300, 400), gsd)
+    said = say("segment", raster, "--weights", weights, "--out", tmp_path / "m.tif")
+    assert said.code == 0, said.err
+    with rasterio.open(tmp_path / "m.tif") as src, rasterio.open(raster) as own:
+        assert src.shape == pytest.approx(size, abs=2)  # the projection's metres are not quite the ground's
+        assert src.bounds == pytest.approx(own.bounds)
+
+
+def test_degrees_and_turned_rasters(weights: Path, tmp_path: Path, say: Say) -> None:
+    step = 3e-6
+    lonlat = Affine(step, 0, 127.0, 0, -step, 37.0)
+    write_raster(tmp_path / "deg.tif", town(300, 300), crs="EPSG:4326", transform=lonlat)
+    assert say("segment", tmp_path / "deg.tif", "--weights", weights, "--out", tmp_path / "m.tif").code == 0
+    with rasterio.open(tmp_path / "m.tif") as src:
+        rows, cols = src.shape
+        assert cols / rows == pytest.approx(np.cos(np.radians(37)), abs=0.01)
+    turned = Affine.translation(195_000, 446_000) @ Affine.rotation(30) @ Affine.scale(0.5, -0.5)
+    write_raster(tmp_path / "turned.tif", town(100, 100), transform=turned)
+    said = say("segment", tmp_path / "turned.tif", "--weights", weights, "--out", tmp_path / "t.tif")
+    assert said.code == 0, said.err
+    with rasterio.open(tmp_path / "t.tif") as src:
+        assert src.transform.almost_equals(turned, 1e-9)
+
+
+def test_grey_palette_and_other_bands(weights: Path, tmp_path: Path, say: Say) -> None:
+    image = town(100, 120)
+    write_raster(tmp_path / "rgb.tif", image)
+    write_raster(tmp_path / "grey.tif", image[:, :, :1])
+    write_raster(
+        tmp_path / "five.tif", np.concatenate([image[:, :, :1] * 0, image, image * 0], axis=2)[:, :, :5]
+    )
+    write_raster(tmp_path / "levels.tif", image.astype(np.uint16) * 40 + 300)
+    with rasterio.open(
+        tmp_path / "palette.tif", "w", driver="GTiff", count=1, height=100, width=120, dtype="uint8", crs=CRS,
+        transform=Affine(0.5, 0, 195_000, 0, -0.5, 446_000),
+    ) as dst:  # fmt: skip
+        dst.write((image[:, :, 0] > 100).astype(np.uint8), 1)
+        dst.write_colormap(1, {0: (60, 60, 60, 255), 1: (200, 200, 200, 255)})
+    with rasterio.open(tmp_path / "palette.tif") as src:
+        assert src.colorinterp == (ColorInterp.palette,)
+    answers = {}
+    for name, words in {
+        "rgb": (), "grey": (), "palette": (), "five": ("--bands", "2,3,4"), "levels": ("--levels", "300,10500"),
+    }.items():  # fmt: skip
+        out = tmp_path / f"{name}-p.tif"
+        said = say("segment", tmp_path / f"{name}.tif", "--weights", weights, "--out", out, *words)
+        assert said.code == 0, said.err
+        with rasterio.open(out) as src:
+            answers[name] = src.read(1)
+    for name, answer in answers.items():
+        assert (answer == answers["rgb"]).all(), name
+
+
+def test_rasters_that_cannot_be_are_refused_in_one_line(
+    weights: Path,
+    tmp_path: Path,
+    say: Say,
+) -> None:
+    image = town(64, 64)
+    whole = write_raster(tmp_path / "whole.tif", image)
+    write_raster(tmp_path / "no-crs.tif", image, crs=None)
+    write_raster(tmp_path / "coarse.tif", image, gsd=30.0)
+    write_raster(tmp_path / "deep.tif", image.astype(np.uint16))
+    write_raster(tmp_path / "tiny.tif", image[:8])
+    cut = tmp_path / "cut.tif"
+    cut.write_bytes(whole.read_bytes()[:5000])
+    (tmp_path / "text.tif").write_text("no raster")
+    out = tmp_path / "m.tif"
+    cases = {
+        "none.tif": ((), "no such folder or raster"),
+        "no-crs.tif": ((), "no coordinate reference system"),
+        "coarse.tif": ((), "too coarse"),
+        "deep.tif": ((), "--levels LOW,HIGH"),
+        "tiny.tif": ((), "at least 16 px"),
+        "cut.tif": ((), "cut.tif"),
+        "text.tif": ((), "not a readable raster"),
+        "whole.tif": (("--bands", "1,2,9"), "has bands 1 to 3"),
+    }
+    for name, (words, said) in cases.items():
+        line = say("segment", tmp_path / name, "--weights", weights, "--out", out, *words).line
+        assert said in line, name
+        assert not out.exists()
+    assert "is the raster itself" in say("segment", whole, "--weights", weights, "--out", whole).line
+    assert "ends in .tif" in say("segment", whole, "--weights", weights, "--out", tmp_path / "m.png").line
+    assert (
+        "then a higher white"
+        in say("segment", whole, "--weights", weights, "--out", out, "--levels", "9,3").line
+    )
+    assert not [p for p in os.listdir(tmp_path) if p.startswith(".")]
