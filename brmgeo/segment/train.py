@@ -1,0 +1,435 @@
+"""Training the U-Net: loss, schedule, averaged weights, and a run that can be killed at any moment and taken up again.
+
+Step k sees crops that follow from (seed, k, place in the batch) and from nothing else, so nothing but the step's number,
+the weights and the optimiser's moments is needed to go on: a run that was killed and resumed gives the same weights, bit
+for bit on the same machine with the same number of threads, as one that was not. The checkpoint is one safetensors
+file that replaces the one before atomically.
+
+AdamW (Loshchilov and Hutter 2019) under a cosine schedule with linear warm-up; binary cross-entropy plus a Tversky term
+(Salehi et al. 2017; soft Dice where both of its weights are one half) against the imbalance of buildings and ground;
+an exponential moving average of all weights, which is what is validated and kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn import functional
+
+from brmgeo.errors import InputError, SettingsError
+from brmgeo.segment.augment import AugmentSettings, Source, draw_crop
+from brmgeo.segment.tiles import BUILDING, UNKNOWN
+from brmgeo.segment.unet import UNet, UNetSettings
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+MEAN, STD = (0.45, 0.45, 0.42), (0.22, 0.21, 0.21)
+FORMAT, VERSION = "brmgeo-checkpoint", 1
+
+
+@dataclass(frozen=True, slots=True)
+class TrainSettings:
+    """One training run.
+
+    Attributes:
+        seed: of the weights and of every crop.
+        steps: of the optimiser, at most.
+        batch: crops a forward pass; accumulate: passes a step (their gradients are averaged).
+        crop_px: side of a crop, a multiple of the U-Net's ``multiple_px``.
+        lr, warmup_steps: the highest learning rate, and the steps to reach it; then a cosine down to a hundredth.
+        weight_decay: of convolution weights; norms and biases have none.
+        ema: decay of the moving average of the weights, a step.
+        overlap_weight: of the Tversky term, beside cross-entropy's 1.
+        false_positives, false_negatives: weights of the two errors in the Tversky term.
+        epoch_steps: steps between validations.
+        patience: epochs without a better validation loss after which training stops; 0: never.
+        checkpoint_steps: steps between checkpoints; one is also written at every epoch.
+        threads: of torch; 0 leaves them as they are.
+        device: ``cpu``, ``cuda``, or ``auto``: a GPU where there is one, in bfloat16.
+
+    Raises SettingsError for values that cannot be trained with.
+    """
+
+    seed: int = 1
+    steps: int = 2000
+    batch: int = 6
+    accumulate: int = 1
+    crop_px: int = 192
+    lr: float = 2e-3
+    warmup_steps: int = 100
+    weight_decay: float = 0.01
+    ema: float = 0.995
+    overlap_weight: float = 0.5
+    false_positives: float = 0.5
+    false_negatives: float = 0.5
+    epoch_steps: int = 100
+    patience: int = 0
+    checkpoint_steps: int = 50
+    threads: int = 0
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        whole = ("steps", "batch", "accumulate", "crop_px", "epoch_steps", "checkpoint_steps")
+        for name in whole:
+            if getattr(self, name) < 1:
+                raise SettingsError(f"training {name} {getattr(self, name)}: give 1 or more")
+        if not 0 < self.lr < 1 or not 0 <= self.ema < 1 or not 0 <= self.warmup_steps < self.steps:
+            raise SettingsError(
+                f"training lr {self.lr}, ema {self.ema}, warmup_steps {self.warmup_steps}: lr lies in (0, 1), "
+                f"ema in [0, 1), the warm-up within the {self.steps} steps"
+            )
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise SettingsError(f"training device {self.device!r}: give auto, cpu or cuda")
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """What is known after an epoch: mean training loss, validation loss and IoU at 0.5 of the averaged weights."""
+
+    epoch: int
+    step: int
+    lr: float
+    loss: float
+    validation_loss: float
+    validation_iou: float
+
+
+@dataclass(slots=True)
+class Run:
+    """A training run between two steps: everything that a checkpoint holds."""
+
+    step: int
+    model: UNet
+    average: UNet
+    best: dict[str, Tensor]
+    optimiser: torch.optim.AdamW
+    history: list[Epoch] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+
+    @property
+    def best_epoch(self) -> Epoch | None:
+        """The epoch with the lowest validation loss."""
+        return min(self.history, key=lambda e: e.validation_loss) if self.history else None
+
+
+def normalised(image: U8) -> F32:
+    """(..., h, w, 3) uint8 RGB to (..., 3, h, w) float32, (x / 255 - MEAN) / STD, as the network takes it."""
+    x = (image.astype(np.float32) / 255.0 - np.array(MEAN, np.float32)) / np.array(STD, np.float32)
+    return np.ascontiguousarray(np.moveaxis(x, -1, -3))
+
+
+def batch_of(
+    source: Source, seed: int, step: int, part: int, size: int, crop_px: int, augment: AugmentSettings
+) -> tuple[U8, U8]:
+    """(n, s, s, 3) and (n, s, s) uint8: the crops of one forward pass, from (seed, step, part) alone."""
+    crops = [
+        draw_crop(source, np.random.default_rng([seed, step, part, k]), crop_px, augment) for k in range(size)
+    ]
+    return np.stack([c[0] for c in crops]), np.stack([c[1] for c in crops])
+
+
+def loss_of(logits: Tensor, label: Tensor, settings: TrainSettings) -> Tensor:
+    """The loss over known pixels: binary cross-entropy + weight * (1 - Tversky index of the batch).
+
+    logits (n, 1, h, w) float; label (n, h, w) uint8. A batch without any known pixel costs 0.
+    """
+    x = logits.squeeze(1).float()
+    known = (label != UNKNOWN).float()
+    y = (label == BUILDING).float()
+    count = known.sum().clamp(min=1.0)
+    entropy = (functional.binary_cross_entropy_with_logits(x, y, reduction="none") * known).sum() / count
+    p = torch.sigmoid(x) * known
+    hit = (p * y).sum()
+    wrong = settings.false_positives * (p * (1 - y)).sum()
+    wrong = wrong + settings.false_negatives * ((1 - p) * y * known).sum()
+    overlap = (hit + 1.0) / (hit + wrong + 1.0)
+    return entropy + settings.overlap_weight * (1 - overlap)
+
+
+def rate_at(step: int, settings: TrainSettings) -> float:
+    """The learning rate of a step (from 0): linear warm-up, then a cosine down to a hundredth."""
+    if step < settings.warmup_steps:
+        return settings.lr * (step + 1) / settings.warmup_steps
+    done = (step - settings.warmup_steps) / max(settings.steps - settings.warmup_steps, 1)
+    return settings.lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0))))
+
+
+class Trainer:
+    """One training run in one folder.
+
+    Args:
+        unet, settings, augment: what is trained, and how.
+        source: of training crops.
+        validation: (images (n, s, s, 3) uint8, labels (n, s, s) uint8), the same for every epoch; held-out ground.
+        folder: where ``checkpoint.safetensors`` lies.
+        data: names the sources and their contents; a checkpoint of other data is not resumed.
+
+    Raises SettingsError for a crop size that the U-Net does not take.
+    """
+
+    def __init__(
+        self,
+        unet: UNetSettings,
+        settings: TrainSettings,
+        augment: AugmentSettings,
+        source: Source,
+        validation: tuple[U8, U8],
+        folder: Path,
+        data: str = "",
+    ) -> None:
+        if settings.crop_px % unet.multiple_px:
+            raise SettingsError(
+                f"crops of {settings.crop_px} px: a U-Net of {len(unet.widths)} levels takes multiples of {unet.multiple_px}"
+            )
+        self._unet, self._settings, self._augment = unet, settings, augment
+        self._source, self._validation = source, validation
+        self._path = folder / "checkpoint.safetensors"
+        what = {
+            "unet": unet.plain(),
+            "settings": {
+                k: v for k, v in asdict(settings).items() if k not in ("threads", "device", "checkpoint_steps")
+            },
+            "augment": asdict(augment),
+            "data": data,
+        }
+        self._digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        gpu = settings.device != "cpu" and torch.cuda.is_available()
+        if settings.device == "cuda" and not gpu:
+            raise SettingsError("training device cuda: there is no GPU that torch can use; leave it at auto")
+        self.device = torch.device("cuda" if gpu else "cpu")
+
+    def start(self) -> Run:
+        """The run of the checkpoint where there is one, otherwise a new one.
+
+        Raises InputError where the checkpoint is damaged or of another run.
+        """
+        if self._settings.threads:
+            torch.set_num_threads(self._settings.threads)
+        with torch.random.fork_rng():
+            torch.manual_seed(self._settings.seed)
+            model = UNet(self._unet)
+        average = UNet(self._unet)
+        average.load_state_dict(model.state_dict())
+        for net in (model, average):
+            net.to(self.device, memory_format=torch.channels_last)
+        decayed = [p for p in model.parameters() if p.ndim > 1]
+        others = [p for p in model.parameters() if p.ndim <= 1]
+        optimiser = torch.optim.AdamW(
+            [
+                {"params": decayed, "weight_decay": self._settings.weight_decay},
+                {"params": others, "weight_decay": 0.0},
+            ],
+            lr=self._settings.lr,
+            betas=(0.9, 0.99),
+        )
+        run = Run(0, model, average, _copy(average.state_dict()), optimiser)
+        if self._path.exists():
+            self._load(run)
+        return run
+
+    def train(
+        self, on_epoch: Callable[[Run, F32], None] | None = None, on_step: Callable[[int, float], None] | None = None
+    ) -> Run:
+        """Trains to the last step or until patience runs out, from the checkpoint where there is one.
+
+        ``on_epoch(run, probability)`` is called after every epoch with the validation crops' (n, s, s) probabilities, before the
+        epoch is written to the checkpoint; ``on_step(step, loss)`` after every step.
+        """
+        s = self._settings
+        run = self.start()
+        while run.step < s.steps and not self._exhausted(run):
+            loss = self.advance(run)
+            if on_step:
+                on_step(run.step, loss)
+            if run.step % s.epoch_steps == 0 or run.step == s.steps:
+                probability = self._close_epoch(run)
+                if on_epoch:
+                    on_epoch(run, probability)
+                self.save(run)
+            elif run.step % s.checkpoint_steps == 0:
+                self.save(run)
+        return run
+
+    def advance(self, run: Run) -> float:
+        """One step of the optimiser; its loss."""
+        s = self._settings
+        lr = rate_at(run.step, s)
+        for group in run.optimiser.param_groups:
+            group["lr"] = lr
+        run.model.train()
+        run.optimiser.zero_grad(set_to_none=True)
+        total = 0.0
+        for part in range(s.accumulate):
+            images, labels = batch_of(
+                self._source, s.seed, run.step, part, s.batch, s.crop_px, self._augment
+            )
+            x = torch.from_numpy(normalised(images)).to(self.device, memory_format=torch.channels_last)
+            with self._precision():
+                logits = run.model(x)
+            loss = loss_of(logits, torch.from_numpy(labels).to(self.device), s) / s.accumulate
+            loss.backward()  # type: ignore[no-untyped-call]
+            total += float(loss.detach())
+        torch.nn.utils.clip_grad_norm_(run.model.parameters(), 1.0)
+        run.optimiser.step()
+        run.step += 1
+        # A young average forgets its random start quickly.
+        decay = min(s.ema, (1 + run.step) / (10 + run.step))
+        with torch.no_grad():
+            for kept, new in zip(run.average.state_dict().values(), run.model.state_dict().values()):
+                if kept.is_floating_point():
+                    kept.lerp_(new, 1 - decay)
+                else:
+                    kept.copy_(new)
+        run.losses.append(total)
+        return total
+
+    def _precision(self) -> contextlib.AbstractContextManager[Any]:
+        if self.device.type == "cuda":
+            return torch.autocast("cuda", torch.bfloat16)
+        return contextlib.nullcontext()
+
+    def _close_epoch(self, run: Run) -> F32:
+        images, labels = self._validation
+        logits = np.concatenate([predict(run.average, images[i : i + 8]) for i in range(0, len(images), 8)])
+        loss = float(loss_of(torch.from_numpy(logits)[:, None], torch.from_numpy(labels), self._settings))
+        known, built = labels != UNKNOWN, labels == BUILDING
+        marked = (logits > 0) & known
+        union = np.count_nonzero(marked | built)
+        iou = np.count_nonzero(marked & built) / union if union else 1.0
+        before = run.best_epoch
+        epoch = Epoch(
+            len(run.history) + 1,
+            run.step,
+            rate_at(run.step - 1, self._settings),
+            float(np.mean(run.losses)),
+            loss,
+            float(iou),
+        )
+        run.history.append(epoch)
+        run.losses.clear()
+        if before is None or loss < before.validation_loss:
+            run.best = _copy(run.average.state_dict())
+        return np.asarray(1 / (1 + np.exp(-logits)), np.float32)
+
+    def _exhausted(self, run: Run) -> bool:
+        best = run.best_epoch
+        patience = self._settings.patience
+        return bool(patience and best and len(run.history) - best.epoch >= patience)
+
+    # --- the checkpoint ------------------------------------------------------------------------------------------
+
+    def save(self, run: Run) -> None:
+        """Replaces the checkpoint atomically by one of this moment."""
+        tensors: dict[str, Tensor] = {}
+        parts = {"model": run.model.state_dict(), "average": run.average.state_dict(), "best": run.best}
+        for part, state in parts.items():
+            tensors |= {f"{part}/{name}": t.detach().cpu().contiguous() for name, t in state.items()}
+        for number, state in run.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser/{number}/{name}": t.detach().cpu().contiguous() for name, t in state.items()}
+        # Shared storage (a state and its copy) is refused by safetensors: each tensor gets its own.
+        tensors = {name: t.clone() for name, t in tensors.items()}
+        facts = {
+            "format": FORMAT,
+            "version": VERSION,
+            "digest": self._digest,
+            "step": run.step,
+            "history": [asdict(e) for e in run.history],
+            "losses": run.losses,
+        }
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        new = self._path.with_name(f".{self._path.name}.{os.getpid()}")
+        try:
+            save_file(tensors, new, {"brmgeo": json.dumps(facts)})
+            with new.open("rb") as file:
+                os.fsync(file.fileno())
+            new.replace(self._path)
+        finally:
+            new.unlink(missing_ok=True)
+
+    def _load(self, run: Run) -> None:
+        path = self._path
+        try:
+            with safetensors.safe_open(path, "pt") as file:
+                facts = json.loads((file.metadata() or {})["brmgeo"])
+            tensors = load_file(path)
+        except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
+            raise InputError(
+                f"{path}: is not a checkpoint ({' '.join(str(error).split())[:100]}); delete it to begin again"
+            ) from None
+        if facts.get("format") != FORMAT or facts.get("version") != VERSION:
+            raise InputError(f"{path}: is a checkpoint of another version; delete it to begin again")
+        if facts["digest"] != self._digest:
+            raise InputError(
+                f"{path}: belongs to a run with other settings or data; name another folder, or delete it to begin again"
+            )
+        run.model.load_state_dict(_part(tensors, "model"))
+        run.average.load_state_dict(_part(tensors, "average"))
+        run.best = _part(tensors, "best")
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in _part(tensors, "optimiser").items():
+            number, key = name.split("/")
+            state.setdefault(int(number), {})[key] = tensor
+        groups = run.optimiser.state_dict()["param_groups"]
+        run.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        run.step = facts["step"]
+        run.history = [Epoch(**e) for e in facts["history"]]
+        run.losses = facts["losses"]
+
+
+def _copy(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: t.detach().cpu().clone() for name, t in state.items()}
+
+
+def _part(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    return {name.removeprefix(part + "/"): t for name, t in tensors.items() if name.startswith(part + "/")}
+
+
+def validation_crops(
+    sources: Sequence[Source], each: int, crop_px: int, gsd_m: float, seed: int = 0
+) -> tuple[U8, U8]:
+    """(n, s, s, 3) and (n, s, s) uint8: ``each`` unchanged crops at ``gsd_m`` out of every source, the same for the same seed."""
+    plain = AugmentSettings.none(gsd_m)
+    parts = [batch_of(source, seed, 0, k, each, crop_px, plain) for k, source in enumerate(sources)]
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+@contextlib.contextmanager
+def _evaluating(net: UNet) -> Iterator[None]:
+    before = net.training
+    net.eval()
+    try:
+        with torch.inference_mode():
+            yield
+    finally:
+        net.train(before)
+
+
+def predict(net: UNet, images: U8) -> F32:
+    """(n, h, w) float32 logits of (n, h, w, 3) uint8 RGB of any size: mirrored at the edges up to what the U-Net takes."""
+    n, h, w, _ = images.shape
+    multiple = net.settings.multiple_px
+    pad = ((0, 0), (0, -h % multiple), (0, -w % multiple), (0, 0))
+    x = normalised(np.pad(images, pad, mode="symmetric"))
+    device = next(net.parameters()).device
+    with _evaluating(net):
+        y = net(torch.from_numpy(x).to(device, memory_format=torch.channels_last))
+    return np.asarray(y[:, 0, :h, :w].cpu().numpy(), np.float32)
+
+
+def tensors_of(state: Mapping[str, Tensor]) -> dict[str, NDArray[Any]]:
+    """The weights as arrays, for ``brmgeo.segment.weights``."""
+    return {name: t.detach().cpu().numpy() for name, t in state.items()}

@@ -1,0 +1,681 @@
+"""`brmgeo train`: from a recipe and its sources to a trained network with its curves, pictures and scores.
+
+A recipe is a TOML file (data/recipes): the U-Net, the training run, the augmentation, and the sources. A source is ground
+of one of these kinds:
+
+- ``generated``: towns that brmgeo invents, by seed, painted once and kept in data/work/scenes;
+- ``tiles``: training tiles that ``brmgeo tiles`` cut, of regions by name (cut now where they are not there yet);
+- ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
+- ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
+- ``flight``: a flight folder whose frames have masks; for tests only.
+
+Folders that are not part of the project are given with ``--source NAME=PATH``.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.flight.folder import read_flight
+from brmgeo.geo.grid import lattice
+from brmgeo.maps.rasterize import building_mask
+from brmgeo.region import describe_fault
+from brmgeo.segment.augment import AugmentSettings, Source, shrunk
+from brmgeo.segment.metrics import LogitHistogram, Scores, segmentation_scores
+from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles, blank_unknown
+from brmgeo.segment.shards import TileSet, check_label, read_tiles
+from brmgeo.segment.tiles import BUILDING, UNKNOWN
+from brmgeo.synth.day import another_day
+from brmgeo.synth.imagery import render_imagery
+from brmgeo.synth.scene import Season, TownStyle
+from brmgeo.synth.town import generate_town
+from pipelines.masks import frame_gsd_m
+
+T = TypeVar("T")
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+SCENES_VERSION = 1
+_ORIGIN = (200_000.0, 500_000.0)
+_SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif")
+_FRAME_PX = 512
+_FRAMES_MOST = 150
+
+
+# --- recipes -----------------------------------------------------------------------------------------------------
+
+
+class _Spec(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SourceSpec(_Spec):
+    """One source of a recipe; see the head of this file for the kinds.
+
+    ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation. ``tiles`` that
+    are for training take their regions' own train and validation splits. ``weight``: how often it is drawn in training.
+    """
+
+    name: str
+    kind: Literal["generated", "tiles", "pairs", "xyz", "flight"]
+    split: Literal["train", "validation", "test"] = "train"
+    weight: Annotated[float, Field(gt=0)] = 1.0
+    seeds: tuple[int, ...] = ()
+    days: Annotated[int, Field(ge=0, le=2)] = 0
+    size_m: Annotated[float, Field(ge=300, le=3000)] = 700.0
+    regions: tuple[str, ...] = ()
+    gsd_m: Annotated[float, Field(gt=0, le=1)] | None = None
+    zoom: Annotated[int, Field(ge=10, le=24)] = 21
+    validation_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    attribution: str = ""
+    licence: str = ""
+
+
+class Recipe(_Spec):
+    """A training run as a file: what is trained, on what, how. ``work_gsd_m``: pictures of untrained GSDs are resampled to it."""
+
+    title: str
+    work_gsd_m: Annotated[float, Field(gt=0, le=2)]
+    validation_crops: Annotated[int, Field(ge=1, le=500)] = 24
+    unet: dict[str, Any] = {}
+    training: dict[str, Any] = {}
+    augment: dict[str, Any] = {}
+    source: tuple[SourceSpec, ...]
+
+
+def read_recipe(path: Path) -> Recipe:
+    """The recipe in a file. Raises MissingInputError, or SettingsError in one line, naming file, key and fault."""
+    try:
+        return Recipe.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        known = ", ".join(sorted(p.stem for p in path.parent.glob("*.toml"))) or "none"
+        raise MissingInputError(f"{path}: there is no such recipe; there are: {known}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not valid TOML: {error}") from None
+    except ValidationError as error:
+        raise SettingsError(f"{path}: {describe_fault(error, Recipe)}") from None
+
+
+# --- sources -----------------------------------------------------------------------------------------------------
+
+
+def generated_scene(seed: int, size_m: float, gsd_m: float, day: int, cache: Path) -> Scene:
+    """A town of ``size_m`` square that ``TownStyle.varied(seed)`` styles, painted at ``gsd_m``; ``day`` > 0 is another season.
+
+    Painted once and kept in ``cache`` under the digest of what it was made from.
+    """
+    what = f"{SCENES_VERSION} {seed} {size_m!r} {gsd_m!r} {day}"
+    path = cache / f"town-{seed}-{day}-{hashlib.sha256(what.encode()).hexdigest()[:12]}.npy"
+    name = f"town {seed}" + (f", day {day}" if day else "")
+    if not path.exists():
+        # Each seed has a place of its own, so that noise anchored to the world differs too.
+        left, bottom = _ORIGIN[0] + 2000.0 * (seed % 50), _ORIGIN[1] + 2000.0 * (seed // 50)
+        bounds = (left, bottom, left + size_m, bottom + size_m)
+        town = generate_town(bounds, seed, TownStyle.varied(seed))
+        if day:
+            other = [s for s in _SEASONS if s != town.style.season]
+            town = another_day(town, other[(seed + day) % 3], 1000 * day + seed)
+        box = lattice(bounds, town.crs, gsd_m)
+        image = render_imagery(town, box)
+        mask = building_mask([b.polygon for b in town.buildings], box.affine, (box.shape[0], box.shape[1]))
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=cache, suffix=".part", delete=False) as file:
+            np.save(file, np.dstack([image, mask * np.uint8(BUILDING)]))
+        os.replace(file.name, path)
+    both = np.load(path)
+    return Scene(np.ascontiguousarray(both[..., :3]), np.ascontiguousarray(both[..., 3]), gsd_m, name)
+
+
+def read_pairs(folder: Path) -> tuple[list[str], list[U8], list[U8]]:
+    """Names, RGB images and labels of ``folder``/images and /masks.
+
+    Raises MissingInputError where there are none or one of a pair is missing, InputError for unreadable or unequal ones.
+    """
+    names, images, labels = [], [], []
+    pictures = sorted(p for p in (folder / "images").glob("*") if p.suffix.lower() in _PICTURES)
+    if not pictures:
+        raise MissingInputError(
+            f"{folder}: holds no images/*.png or *.jpg: name a folder with images/ and masks/"
+        )
+    for path in pictures:
+        mask_path = folder / "masks" / f"{path.stem}.png"
+        if not mask_path.exists():
+            raise MissingInputError(
+                f"{mask_path}: is not there, but {path.name} is: every image needs its mask"
+            )
+        image, mask = (
+            cv2.imread(str(path), cv2.IMREAD_COLOR),
+            cv2.imread(str(mask_path), cv2.IMREAD_UNCHANGED),
+        )
+        if image is None or mask is None or image.shape[:2] != mask.shape[:2]:
+            raise InputError(f"{path}: it or its mask cannot be read, or their sizes differ")
+        image = np.ascontiguousarray(image[..., ::-1])
+        names.append(path.stem)
+        images.append(image)
+        labels.append(blank_unknown(image, check_label(mask, mask_path.name)))
+    return names, images, labels
+
+
+def xyz_scenes(folder: Path, zoom: int, validation_share: float) -> tuple[list[Scene], list[Scene]]:
+    """(train, validation) scenes put together from tiles named ...X-Y-Z; one scene for every group of tiles that touch.
+
+    The western columns of the largest group are the validation scene, about ``validation_share`` of it; the column next to them
+    belongs to neither. Raises as ``read_pairs``, and InputError where no name holds X-Y-``zoom``.
+    """
+    names, images, labels = read_pairs(folder)
+    tiles: dict[tuple[int, int], tuple[U8, U8]] = {}
+    for name, image, label in zip(names, images, labels):
+        found = re.search(r"(\d+)-(\d+)-(\d+)$", name)
+        if found and int(found[3]) == zoom:
+            tiles[int(found[1]), int(found[2])] = (image, label)
+    if not tiles:
+        raise InputError(
+            f"{folder}: no image is named ...X-Y-{zoom}: those are the tiles of zoom level {zoom}"
+        )
+    # Ground metres: web-mercator's pixel shrinks with the cosine of the latitude.
+    y = sum(k[1] for k in tiles) / len(tiles)
+    latitude = math.atan(math.sinh(math.pi * (1 - 2 * (y + 0.5) / 2**zoom)))
+    side = next(iter(tiles.values()))[1].shape[0]
+    gsd = 40_075_016.69 * math.cos(latitude) / 2**zoom / side
+    groups = sorted(_touching(set(tiles)), key=lambda g: (-len(g), min(g)))
+    columns = sorted({x for x, _ in groups[0]})
+    held = max(1, round(validation_share * len(columns))) if validation_share > 0 else 0
+    cut = columns[held - 1] if held else columns[0] - 2
+    train = [{k for k in groups[0] if k[0] > cut + 1}, *groups[1:]]
+    validation = [{k for k in groups[0] if k[0] <= cut}]
+    return (
+        [_assembled(tiles, g, side, gsd, folder.name) for g in train if g],
+        [_assembled(tiles, g, side, gsd, folder.name) for g in validation if g],
+    )
+
+
+def _touching(keys: set[tuple[int, int]]) -> list[set[tuple[int, int]]]:
+    groups = []
+    left = set(keys)
+    while left:
+        todo, group = [left.pop()], set[tuple[int, int]]()
+        while todo:
+            x, y = todo.pop()
+            group.add((x, y))
+            near = {(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)} & left
+            left -= near
+            todo += near
+        groups.append(group)
+    return groups
+
+
+def _assembled(
+    tiles: dict[tuple[int, int], tuple[U8, U8]], keys: set[tuple[int, int]], side: int, gsd: float, name: str
+) -> Scene:
+    x0, y0 = min(x for x, _ in keys), min(y for _, y in keys)
+    w, h = max(x for x, _ in keys) - x0 + 1, max(y for _, y in keys) - y0 + 1
+    image = np.zeros((h * side, w * side, 3), np.uint8)
+    label = np.full((h * side, w * side), UNKNOWN, np.uint8)
+    for x, y in keys:
+        at = (slice((y - y0) * side, (y - y0 + 1) * side), slice((x - x0) * side, (x - x0 + 1) * side))
+        image[at], label[at] = tiles[x, y]
+    return Scene(image, label, gsd, name)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One frame to be scored: how to read its (image, label), and its GSD."""
+
+    read: Callable[[], tuple[U8, U8]]
+    gsd_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Everything that a recipe's sources hold.
+
+    Attributes:
+        train: where training crops come from.
+        crops: (name, source) to take validation crops from.
+        validation, test: name -> frames.
+        credits: name, kind, split, attribution and licence of each source, for the model card.
+        digest: of the contents of what is trained and validated on.
+    """
+
+    train: Source
+    crops: list[tuple[str, Source]]
+    validation: dict[str, list[Picture]]
+    test: dict[str, list[Picture]]
+    credits: list[dict[str, Any]]
+    digest: str
+
+
+def gather(
+    recipe: Recipe,
+    data: Path,
+    paths: Mapping[str, Path],
+    test_regions: Sequence[str],
+    finest_m: float,
+    say: Callable[[str], None],
+) -> Ground:
+    """The sources of a recipe, read or made.
+
+    Args:
+        paths: name of a source -> its folder, for those of the kinds pairs, xyz and flight. A test source whose folder is not
+            given is left out; a training source must be there.
+        test_regions: regions to test on besides the recipe's own.
+        finest_m: the finest GSD of any crop: what is much finer is averaged down once, here.
+
+    Raises MissingInputError and InputError as the readers do, SettingsError for a path that no source asks for and for regions that
+    must not be trained on.
+    """
+    names = {s.name for s in recipe.source if s.kind in ("pairs", "xyz", "flight")}
+    for name in paths:
+        if name not in names:
+            raise SettingsError(
+                f"--source {name}=...: the recipe asks for {', '.join(sorted(names)) or 'no folder'}; name one of these"
+            )
+    train: list[tuple[Source, float]] = []
+    crops: list[tuple[str, Source]] = []
+    frames: dict[str, dict[str, list[Picture]]] = {"validation": {}, "test": {}}
+    credits = []
+    digest = hashlib.sha256()
+
+    def use(name: str, split: str, scenes: list[Scene], weight: float) -> None:
+        if not scenes:
+            return
+        if split == "train":
+            train.append((Scenes([_reduced(s, finest_m) for s in scenes]), weight))
+        else:
+            frames[split][name] = [p for s in scenes for p in _frames_of(s, recipe.work_gsd_m)]
+        if split == "validation":
+            crops.append((name, Scenes([_reduced(s, finest_m) for s in scenes])))
+        if split != "test":
+            for scene in scenes:
+                digest.update(scene.name.encode() + str(scene.gsd_m).encode())
+                digest.update(hashlib.sha256(scene.image.tobytes() + scene.label.tobytes()).digest())
+
+    extra = [SourceSpec(name=r, kind="tiles", split="test", regions=(r,)) for r in test_regions]
+    named = {r for s in recipe.source for r in s.regions}
+    for spec in (*recipe.source, *(s for s in extra if s.name not in named)):
+        if spec.name in names and spec.name not in paths:
+            if spec.split == "test":
+                say(f"{spec.name}: not tested on, since no --source {spec.name}=PATH is given")
+                continue
+            raise MissingInputError(
+                f"recipe {recipe.title!r} trains on {spec.name}: give its folder, --source {spec.name}=PATH"
+            )
+        if spec.kind == "generated":
+            cache = data / "work" / "scenes"
+            gsd = spec.gsd_m or recipe.work_gsd_m
+            jobs = [(seed, day) for seed in spec.seeds for day in range(spec.days + 1)]
+            scenes = []
+            for seed, day in jobs:
+                scenes.append(generated_scene(seed, spec.size_m, gsd, day, cache))
+            use(spec.name, spec.split, scenes, spec.weight)
+        elif spec.kind == "xyz":
+            parts = xyz_scenes(paths[spec.name], spec.zoom, spec.validation_share)
+            use(spec.name, spec.split, parts[0], spec.weight)
+            use(spec.name, "validation", parts[1], spec.weight)
+        elif spec.kind == "pairs":
+            if spec.gsd_m is None or spec.split != "train":
+                raise SettingsError(
+                    f"recipe source {spec.name}: pairs are for training, and need their gsd_m"
+                )
+            _, images, labels = read_pairs(paths[spec.name])
+            # What is mostly blank teaches little, and a mosaic has room for others.
+            seen = [k for k, la in enumerate(labels) if (la != UNKNOWN).mean() > 0.8]
+            k = max(1, int(finest_m / spec.gsd_m + 1e-6))
+            small = [shrunk(images[i], labels[i], k) for i in seen]
+            train.append((Mosaic([a for a, _ in small], [b for _, b in small], spec.gsd_m * k), spec.weight))
+            for image, label in small:
+                digest.update(hashlib.sha256(image.tobytes() + label.tobytes()).digest())
+        elif spec.kind == "flight":
+            if spec.split != "test":
+                raise SettingsError(f'recipe source {spec.name}: a flight is for tests only: split = "test"')
+            frames["test"][spec.name] = _flight_frames(paths[spec.name])
+        else:
+            for part, weight, source, pictures, seen_digest in _tile_sources(spec, data, recipe.work_gsd_m):
+                if part == "train":
+                    train.append((source, weight))
+                else:
+                    frames[part].setdefault(spec.name, []).extend(pictures)
+                if part == "validation":
+                    crops.append((spec.name, source))
+                if part != "test":
+                    digest.update(seen_digest)
+        credits.append(
+            {
+                k: getattr(spec, k)
+                for k in ("name", "kind", "split", "attribution", "licence")
+                if getattr(spec, k)
+            }
+        )
+    if not train or not crops:
+        raise SettingsError(f"recipe {recipe.title!r}: names no ground to train on, or none to validate on")
+    mixture = Mixture([s for s, _ in train], [w for _, w in train])
+    return Ground(mixture, crops, frames["validation"], frames["test"], credits, digest.hexdigest())
+
+
+def _reduced(scene: Scene, finest_m: float) -> Scene:
+    k = max(1, int(finest_m / scene.gsd_m + 1e-6))
+    return Scene(*shrunk(scene.image, scene.label, k), scene.gsd_m * k, scene.name) if k > 1 else scene
+
+
+def _frames_of(scene: Scene, gsd_m: float) -> list[Picture]:
+    """The scene in frames of 512 px at about ``gsd_m``; those that are mostly unknown are left out."""
+    side = math.ceil(_FRAME_PX * gsd_m / scene.gsd_m)
+    h, w = scene.label.shape
+    found = []
+    for r in range(0, max(h - side // 2, 1), side):
+        for c in range(0, max(w - side // 2, 1), side):
+            part = scene.label[r : r + side, c : c + side]
+            if (part != UNKNOWN).mean() < 0.3:
+                continue
+
+            def read(r: int = r, c: int = c) -> tuple[U8, U8]:
+                return scene.image[r : r + side, c : c + side], scene.label[r : r + side, c : c + side]
+
+            found.append(Picture(read, scene.gsd_m))
+    return found
+
+
+def _flight_frames(folder: Path) -> list[Picture]:
+    flight = read_flight(folder)
+    if not (flight.has_images and flight.has_masks):
+        raise MissingInputError(f"{folder}: a flight to test on needs frames and masks")
+
+    def reader(i: int) -> Callable[[], tuple[U8, U8]]:
+        def read() -> tuple[U8, U8]:
+            return np.ascontiguousarray(flight.image(i)), check_label(flight.mask(i), flight.frames[i].file)
+
+        return read
+
+    return [Picture(reader(i), frame_gsd_m(flight, i)) for i in range(len(flight.frames))]
+
+
+def _tile_sources(
+    spec: SourceSpec, data: Path, work_gsd_m: float
+) -> Iterator[tuple[str, float, Source, list[Picture], bytes]]:
+    """(split, weight, source, frames, digest) of each region's tiles; the tiles are cut first where they are not there."""
+    from pipelines import training
+
+    training.require_all_trainable(spec.regions, data, "test" if spec.split == "test" else None)
+    for region in spec.regions:
+        folder = data / "out" / region / "tiles"
+        if not (folder / "tiles.json").is_file():
+            training.cut_region(region, data, None, None, "test" if spec.split == "test" else None)
+        tiles = read_tiles(folder)
+        share = spec.weight / len(spec.regions)
+        for split in ("test",) if spec.split == "test" else ("train", "validation"):
+            chosen = tiles.of_split(split) if spec.split != "test" else list(range(len(tiles)))
+            if not chosen:
+                continue
+            seen = hashlib.sha256(json.dumps([asdict(tiles.infos[i]) for i in chosen]).encode()).digest()
+            yield split, share, Tiles(tiles, chosen), _tile_frames(tiles, chosen, work_gsd_m), seen
+
+
+def _tile_frames(tiles: TileSet, chosen: Sequence[int], work_gsd_m: float) -> list[Picture]:
+    """The tiles of the GSD nearest to ``work_gsd_m``, evenly thinned to what can be scored in a minute."""
+    nearest = min({tiles.infos[i].gsd_m for i in chosen}, key=lambda g: abs(math.log(g / work_gsd_m)))
+    own = [i for i in chosen if tiles.infos[i].gsd_m == nearest]
+    own = [own[k] for k in np.linspace(0, len(own) - 1, min(_FRAMES_MOST, len(own))).astype(int)]
+    return [Picture(lambda i=i: tiles.read(i), nearest) for i in own]  # type: ignore[misc]
+
+
+# --- the run -----------------------------------------------------------------------------------------------------
+
+
+def _settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
+    """A settings dataclass from a recipe's table."""
+    known = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+    foreign = sorted(set(values) - known)
+    if foreign:
+        raise SettingsError(
+            f"recipe, [{where}]: no setting {foreign[0]!r}; there are: {', '.join(sorted(known))}"
+        )
+    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    try:
+        return kind(**plain)
+    except TypeError as error:
+        raise SettingsError(f"recipe, [{where}]: {error}") from None
+
+
+def train(
+    recipe_path: Path,
+    data: Path,
+    out: Path,
+    *,
+    paths: Mapping[str, Path] | None = None,
+    test_regions: Sequence[str] = (),
+    steps: int | None = None,
+    threads: int | None = None,
+    say: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Trains by a recipe, or takes up where a run in ``out`` ended, then calibrates, tests and writes the results.
+
+    ``out`` receives weights.safetensors and .md (the card), model.onnx, metrics.json, curves.csv and .png, reliability.png,
+    pictures/epoch-NNN.png and checkpoint.safetensors; returns what is in metrics.json. Raises SettingsError, InputError.
+    """
+    from brmgeo.segment import train as engine
+    from brmgeo.segment.unet import UNetSettings
+
+    started = time.monotonic()
+    recipe = read_recipe(recipe_path)
+    unet = _settings(UNetSettings, recipe.unet, "unet")
+    settings = _settings(engine.TrainSettings, recipe.training, "training")
+    augment = _settings(AugmentSettings, recipe.augment, "augment")
+    if steps is not None:
+        settings = replace(settings, steps=steps, warmup_steps=min(settings.warmup_steps, steps // 4))
+    settings = replace(settings, threads=threads or os.cpu_count() or 1)
+    ground = gather(recipe, data, paths or {}, test_regions, augment.gsd_m[0], say)
+    crops = engine.validation_crops(
+        [s for _, s in ground.crops], recipe.validation_crops, settings.crop_px, recipe.work_gsd_m
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    trainer = engine.Trainer(unet, settings, augment, ground.train, crops, out, ground.digest)
+    say(
+        f"{recipe.title}: {settings.steps} steps of {settings.batch * settings.accumulate} crops on {trainer.device.type}"
+    )
+    began: list[float] = []
+
+    def on_step(step: int, loss: float) -> None:
+        began.append(time.monotonic())
+        del began[1:-50]
+        if step % 25 == 0 and len(began) > 2:
+            pace = (began[-1] - began[1]) / (len(began) - 2)
+            say(f"step {step} of {settings.steps}, loss {loss:.3f}, {pace:.2f} s a step")
+
+    def on_epoch(run: engine.Run, probability: F32) -> None:
+        last = run.history[-1]
+        write_curves(out, [asdict(e) for e in run.history])
+        _show(out / "pictures" / f"epoch-{last.epoch:03d}.png", *crops, probability)
+        say(
+            f"epoch {last.epoch}, step {last.step}: loss {last.loss:.3f}, validation loss {last.validation_loss:.3f}, "
+            f"IoU {last.validation_iou:.3f}"
+        )
+
+    run = trainer.train(on_epoch, on_step)
+    best = run.best_epoch
+    say(f"trained: {run.step} steps, best epoch {best.epoch if best else 0}")
+    facts = finish(run.best, unet, recipe, augment, ground, out, say, run.step)
+    facts["training"] = {
+        "recipe": recipe_path.stem,
+        "steps": run.step,
+        "best_epoch": best.epoch if best else 0,
+        "seconds_of_this_run": round(time.monotonic() - started),
+        "device": trainer.device.type,
+    }
+    _write_text(out / "metrics.json", json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
+    return facts
+
+
+def finish(
+    state: Mapping[str, Any], unet: Any, recipe: Recipe, augment: AugmentSettings, ground: Ground, out: Path,
+    say: Callable[[str], None], steps: int,
+) -> dict[str, Any]:  # fmt: skip
+    """Calibrates on validation frames, writes weights, card and ONNX, and scores them as a user would run them."""
+    from brmgeo.segment.onnx_export import export_onnx
+    from brmgeo.segment.predict import Segmenter
+    from brmgeo.segment.train import MEAN, STD, tensors_of
+    from brmgeo.segment.weights import ModelCard, save_weights
+
+    low, high = augment.gsd_m
+    card = ModelCard(
+        settings=unet.plain(), mean=MEAN, std=STD, threshold=0.5, temperature=1.0, gsd_min_m=low, gsd_max_m=high,
+        gsd_work_m=recipe.work_gsd_m,
+        data={"recipe": recipe.title, "steps": steps, "sources": ground.credits},
+        licence=licence_of(ground.credits),
+    )  # fmt: skip
+    weights = out / "weights.safetensors"
+    tensors = tensors_of(state)
+    save_weights(weights, tensors, card)
+    export_onnx(weights, out / "model.onnx")
+    raw = Segmenter.load(out / "model.onnx")
+    # Every kind of validation ground counts the same, whatever its area.
+    histogram, parts = LogitHistogram(), []
+    for pictures in ground.validation.values():
+        own = LogitHistogram()
+        for picture in pictures:
+            image, label = picture.read()
+            p = np.clip(raw.probability(image, picture.gsd_m).astype(np.float64), 1e-7, 1 - 1e-7)
+            own.add(np.log(p / (1 - p)).astype(np.float32), label)
+        parts.append(own)
+    most = max(int((h.building + h.other).sum()) for h in parts)
+    for own in parts:
+        times = most / max(int((own.building + own.other).sum()), 1)
+        histogram.building += np.rint(own.building * times).astype(np.int64)
+        histogram.other += np.rint(own.other * times).astype(np.int64)
+    temperature = histogram.temperature()
+    card = replace(
+        card, temperature=round(temperature, 4), threshold=round(histogram.best_threshold(temperature), 3)
+    )
+    calibration = {
+        "temperature": card.temperature,
+        "threshold": card.threshold,
+        "calibration_error_before": round(histogram.calibration_error(1.0), 4),
+        "calibration_error": round(histogram.calibration_error(temperature), 4),
+    }
+    say(f"calibrated on validation: temperature {card.temperature}, threshold {card.threshold}")
+    save_weights(weights, tensors, card)
+    export_onnx(weights, out / "model.onnx")
+    segmenter = Segmenter.load(out / "model.onnx")
+    scores = {
+        f"{split}: {name}": score(segmenter, pictures).summary()
+        for split, sets in (("validation", ground.validation), ("test", ground.test))
+        for name, pictures in sets.items()
+    }
+    for name, row in scores.items():
+        told = ", ".join(f"{k} {v:g}" for k, v in row.items())
+        say(f"{name}: {told}")
+    # The scores belong into the card; the tensors and with them the answers stay what they are.
+    card = replace(card, metrics={"calibration": calibration, **scores})
+    save_weights(weights, tensors, card)
+    export_onnx(weights, out / "model.onnx")
+    _draw_reliability(out / "reliability.png", histogram, temperature)
+    return {"calibration": calibration, "scores": scores}
+
+
+def score(segmenter: Any, pictures: Sequence[Picture]) -> Scores:
+    """The scores of frames by a ``brmgeo.segment.predict.Segmenter``, at the frames' own GSD."""
+    total = Scores()
+    for picture in pictures:
+        image, label = picture.read()
+        probability = segmenter.probability(image, picture.gsd_m)
+        total = total + segmentation_scores(probability, label, segmenter.card.threshold, picture.gsd_m)
+    return total
+
+
+def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
+    """One line for the model card: the weights' own licence and what their sources ask for."""
+    asked = [f"{c['name']}: {c.get('attribution', '')} ({c['licence']})" for c in credits if c.get("licence")]
+    return "Apache-2.0 for the weights" + ("; trained on " + "; ".join(asked) if asked else "")
+
+
+# --- files for people --------------------------------------------------------------------------------------------
+
+
+def _write_text(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
+
+def write_curves(out: Path, epochs: Sequence[Mapping[str, Any]]) -> None:
+    """curves.csv and curves.png: losses, validation IoU and learning rate of every epoch."""
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(epochs[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(epochs)
+    _write_text(out / "curves.csv", table.getvalue())
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.5, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    steps = [e["step"] for e in epochs]
+    left.plot(steps, [e["loss"] for e in epochs], marker="o", ms=3, label="training")
+    left.plot(steps, [e["validation_loss"] for e in epochs], marker="o", ms=3, label="validation")
+    left.set(xlabel="step", ylabel="loss", ylim=(0, None))
+    left.legend(frameon=False)
+    right.plot(steps, [e["validation_iou"] for e in epochs], color="tab:green", marker="o", ms=3)
+    right.set(xlabel="step", ylabel="IoU on validation crops", ylim=(0, 1))
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    part = out / ".curves.png.part"
+    figure.savefig(part, dpi=110, format="png")
+    part.replace(out / "curves.png")
+
+
+def _draw_reliability(path: Path, histogram: LogitHistogram, temperature: float) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2, 4.0), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="0.7", lw=1)
+    for t, name in ((1.0, "as trained"), (temperature, f"temperature {temperature:.2f}")):
+        said, was, _ = histogram.reliability(t)
+        axes.plot(said, was, marker="o", ms=4, label=name)
+    axes.set(
+        xlabel="probability said", ylabel="share that is building", xlim=(0, 1), ylim=(0, 1), aspect="equal"
+    )
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def _show(path: Path, images: U8, labels: U8, probability: F32, most: int = 24, columns: int = 8) -> None:
+    """Crops with their true outlines (yellow) above the probability (blue to red; unknown ground grey)."""
+    chosen = np.linspace(0, len(images) - 1, min(most, len(images))).astype(int)
+    cells = []
+    for i in chosen:
+        shown = np.ascontiguousarray(images[i][..., ::-1])
+        outline, _ = cv2.findContours(
+            (labels[i] == BUILDING).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+        )
+        cv2.drawContours(shown, outline, -1, (0, 255, 255), 1)
+        heat = cv2.applyColorMap((probability[i] * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+        heat[labels[i] == UNKNOWN] = 90
+        cells.append(np.pad(np.vstack([shown, heat]), ((2, 2), (2, 2), (0, 0)), constant_values=255))
+    while len(cells) % columns:
+        cells.append(np.full_like(cells[0], 255))
+    rows = [np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ok, png = cv2.imencode(".png", np.vstack(rows))
+    assert ok
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(png.tobytes())
+    part.replace(path)
