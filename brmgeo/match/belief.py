@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from brmgeo.maps.ratio import _Disjoint
 from brmgeo.match.settings import BeliefSettings
 from brmgeo.match.threads import split
 
@@ -32,17 +33,43 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
+@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=_Disjoint)
+def _convolve(window, half, kx, ky, out):  # type: ignore[no-untyped-def]
+    """out (256,) = a window of (15 + taps) x (15 + taps) cells, flat, through kx along rows, then ky; half is scratch.
+
+    Positions are unsigned: signed ones would be tested for counting from the end, and the loops not be vectorised.
+    """
+    last = np.uint64(len(kx) - 1)
+    side = np.uint64(BLOCK) + last
+    for i in range(side):
+        p, q = np.uint64(i) * side + last, np.uint64(i * BLOCK)
+        for j in range(BLOCK):
+            half[q + np.uint64(j)] = 0.0
+        for v in range(len(kx)):
+            k, first = kx[v], p - np.uint64(v)
+            for j in range(BLOCK):
+                half[q + np.uint64(j)] += k * window[first + np.uint64(j)]
+    for i in range(BLOCK):
+        p, q = np.uint64(i) + last, np.uint64(i * BLOCK)
+        for j in range(BLOCK):
+            out[q + np.uint64(j)] = 0.0
+        for u in range(len(ky)):
+            k, first = ky[u], (p - np.uint64(u)) * np.uint64(BLOCK)
+            for j in range(BLOCK):
+                out[q + np.uint64(j)] += k * half[first + np.uint64(j)]
+
+
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _move(blocks, index, targets, whole, ky, kx, reach, ny, nx, out, t0, t1):  # type: ignore[no-untyped-def]
     """Each target block gathered from its sources: whole-cell shift, then a separable kernel of 2 reach + 1 taps."""
     side = BLOCK + 2 * reach
-    taps = 2 * reach + 1
     nby, nbx = index.shape[1], index.shape[2]
+    window, half = np.empty(side * side, np.float32), np.empty(side * BLOCK, np.float32)
     for t in range(t0, t1):
         h, by, bx = targets[t, 0], targets[t, 1], targets[t, 2]
         top = by * BLOCK - reach - whole[h, 0]
         left = bx * BLOCK - reach - whole[h, 1]
-        window = np.zeros((side, side), np.float32)
+        window[:] = 0.0
         for sy in range(max(0, top // BLOCK), min(nby - 1, (top + side - 1) // BLOCK) + 1):
             for sx in range(max(0, left // BLOCK), min(nbx - 1, (left + side - 1) // BLOCK) + 1):
                 s = index[h, sy, sx]
@@ -51,25 +78,15 @@ def _move(blocks, index, targets, whole, ky, kx, reach, ny, nx, out, t0, t1):  #
                 i0, i1 = max(top, sy * BLOCK), min(top + side, sy * BLOCK + BLOCK)
                 j0, j1 = max(left, sx * BLOCK), min(left + side, sx * BLOCK + BLOCK)
                 for i in range(i0, i1):
-                    for j in range(j0, j1):
-                        window[i - top, j - left] = blocks[s, i - sy * BLOCK, j - sx * BLOCK]
-        half = np.zeros((side, BLOCK), np.float32)
-        for i in range(side):
-            for v in range(taps):
-                k = kx[h, v]
+                    source = blocks[s, i - sy * BLOCK, j0 - sx * BLOCK : j1 - sx * BLOCK]
+                    first = (i - top) * side + j0 - left
+                    window[first : first + j1 - j0] = source
+        _convolve(window, half, kx[h], ky[h], out[t].reshape(BLOCK * BLOCK))
+        if (by + 1) * BLOCK > ny or (bx + 1) * BLOCK > nx:
+            for i in range(BLOCK):
                 for j in range(BLOCK):
-                    half[i, j] += k * window[i, j + taps - 1 - v]
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                out[t, i, j] = 0.0
-            if by * BLOCK + i >= ny:
-                continue
-            for u in range(taps):
-                k = ky[h, u]
-                for j in range(BLOCK):
-                    out[t, i, j] += k * half[i + taps - 1 - u, j]
-            for j in range(max(0, nx - bx * BLOCK), BLOCK):
-                out[t, i, j] = 0.0
+                    if by * BLOCK + i >= ny or bx * BLOCK + j >= nx:
+                        out[t, i, j] = 0.0
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)

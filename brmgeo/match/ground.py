@@ -65,24 +65,34 @@ class GroundMap:
         Returns two (ceil(H / cell_px), ceil(W / cell_px)) float32 in [0, 1]; ground beyond the map's edge counts as
         unknown, so building <= known everywhere.
         """
-        h, w = self.building.shape
-        ny, nx = -(-h // cell_px), -(-w // cell_px)
-        built = np.zeros((ny, nx), np.float32)
-        known = np.zeros((ny, nx), np.float32)
-        # Row bands keep the temporaries small on maps of gigabytes.
-        band = max(1, 2_000_000 // max(1, nx * cell_px * cell_px))
-        for i in range(0, ny, band):
-            rows = self.building[i * cell_px : (i + band) * cell_px]
-            n = -(-rows.shape[0] // cell_px)
-            padded = np.full((n * cell_px, nx * cell_px), UNKNOWN, np.uint8)
-            padded[: rows.shape[0], :w] = rows
-            tiles = padded.reshape(n, cell_px, nx, cell_px)
-            built[i : i + n] = np.count_nonzero(tiles == 1, axis=(1, 3))
-            known[i : i + n] = np.count_nonzero(tiles != UNKNOWN, axis=(1, 3))
-        area = np.float32(cell_px * cell_px)
-        built /= area
-        known /= area
-        return built, known
+        return cell_shares(self.building, cell_px)
+
+
+@nb.njit(cache=True, nogil=True)
+def _count_cells(building, side, built, known, i0, i1):  # type: ignore[no-untyped-def]
+    rows, cols = building.shape
+    for i in range(i0, i1):
+        for y in range(i * side, min(rows, (i + 1) * side)):
+            line = building[y]
+            for j in range(built.shape[1]):
+                some, seen = 0, 0
+                for x in range(j * side, min(cols, (j + 1) * side)):
+                    some += line[x] == 1
+                    seen += line[x] != 255
+                built[i, j] += some
+                known[i, j] += seen
+
+
+def cell_shares(building: NDArray[np.uint8], cell_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``GroundMap.coverage`` of an (H, W) uint8 mask, of which there need not be any building."""
+    h, w = building.shape
+    shape = (-(-h // cell_px), -(-w // cell_px))
+    built, known = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    split(lambda i0, i1: _count_cells(building, cell_px, built, known, i0, i1), shape[0], 64)
+    area = np.float32(cell_px * cell_px)
+    built /= area
+    known /= area
+    return built, known
 
 
 def disc_pixels(radius_px: float) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.flight.values import View
-from brmgeo.match.ground import UNKNOWN, GroundMap
+from brmgeo.match.ground import UNKNOWN, GroundMap, cell_shares
 from brmgeo.match.likelihood import Rates, ViewPoints, view_points
 from brmgeo.match.threads import split
 
@@ -98,7 +98,6 @@ class Registrar:
         self._ground = ground
         self._floor = np.diag([floor_m**2, floor_m**2, floor_rad**2])
         self._coarse_px = max(1, round(self.COARSE_M / ground.gsd_m))
-        self._coarse = ground.coverage(self._coarse_px)
 
     def register(
         self, view: View, pose: F64, window_m: float, window_rad: float, rates: Rates
@@ -116,7 +115,9 @@ class Registrar:
         step = max(cell / max(coarse.reach_m, cell), 0.005)
         n = max(1, math.ceil(window_rad / step))
         yaw = pose[2] + step * np.arange(-n, n + 1)
-        score, at = self._scores(coarse, pose[:2], yaw, half, rates, self._coarse, cell)
+        reach = coarse.reach_m + (half + 2) * cell
+        shares, origin = self._crop(pose[:2], reach, self._coarse_px)
+        score, at = self._scores(coarse, pose[:2], yaw, half, rates, shares, cell, origin)
         first, cov, edge = _moments(score, yaw, cell)
         centre = pose[:2] + first[:2] + at
         # The fine window covers the coarse posterior and its pixels.
@@ -129,23 +130,27 @@ class Registrar:
         fine_step = max(gsd / max(fine.reach_m, gsd), 0.0025)
         n = math.ceil(min(2.5 * math.sqrt(cov[2, 2]) + 0.5 * step, window_rad + step) / fine_step)
         yaw = first[2] + fine_step * np.arange(-n, n + 1)
-        crop, origin = self._crop(centre, fine.reach_m + half * gsd + 2.0)
+        crop, origin = self._crop(centre, fine.reach_m + half * gsd + 2.0, 1)
         score, at = self._scores(fine, centre, yaw, half, rates, crop, gsd, origin)
         second, cov, edge = _moments(score, yaw, gsd)
         place = centre + second[:2] + at
         return self._result(fine, score, np.array([*place, second[2]]), cov, edge, rates, gsd)
 
-    def _crop(self, centre: F64, reach_m: float) -> tuple[tuple[F32, F32], tuple[float, float]]:
-        """Building and known shares of the map's own pixels about ``centre``, and the crop's (left, top)."""
+    def _crop(self, centre: F64, reach_m: float, cell_px: int) -> tuple[tuple[F32, F32], tuple[float, float]]:
+        """Building and known shares of the map's cells of ``cell_px`` pixels about ``centre``, and the crop's (left, top).
+
+        Cells are those of the whole map. The crop is empty where ``centre`` is far off the map.
+        """
         g = self._ground
         col, row = (centre[0] - g.left) / g.gsd_m, (g.top - centre[1]) / g.gsd_m
         reach = reach_m / g.gsd_m
         h, w = g.building.shape
-        r0, r1 = max(0, math.floor(row - reach)), min(h, math.ceil(row + reach))
-        c0, c1 = max(0, math.floor(col - reach)), min(w, math.ceil(col + reach))
+        r0, c0 = (
+            min(max(0, math.floor((v - reach) / cell_px) * cell_px), n) for v, n in ((row, h), (col, w))
+        )
+        r1, c1 = (min(n, math.ceil((v + reach) / cell_px) * cell_px) for v, n in ((row, h), (col, w)))
         cut = g.building[r0 : max(r1, r0), c0 : max(c1, c0)]
-        shares = ((cut == 1).astype(np.float32), (cut != UNKNOWN).astype(np.float32))
-        return shares, (g.left + c0 * g.gsd_m, g.top - r0 * g.gsd_m)
+        return cell_shares(cut, cell_px), (g.left + c0 * g.gsd_m, g.top - r0 * g.gsd_m)
 
     def _scores(
         self,
@@ -156,17 +161,17 @@ class Registrar:
         rates: Rates,
         shares: tuple[F32, F32],
         cell: float,
-        origin: tuple[float, float] | None = None,
+        origin: tuple[float, float],
     ) -> tuple[F32, F64]:
         """Ratios at (yaw, row, col) offsets, and the mean shift that cutting to whole pixels brings: none."""
         a_k, a_o, b_k, b_o = rates.weights(points.rate)
         other = points.known - points.built
         a = (a_k * points.built + a_o * other).astype(np.float32)
         b = (b_k * points.built + b_o * other).astype(np.float32)
-        left, top = origin if origin is not None else (self._ground.left, self._ground.top)
+        left, top = origin
         col, row = (centre[0] - left) / cell, (top - centre[1]) / cell
         out = np.empty((len(yaw), 2 * half + 1, 2 * half + 1), np.float32)
-        whole = bool(shares[1].min() >= 0.9999)
+        whole = bool(shares[1].size and shares[1].min() >= 0.9999)
         split(
             lambda h0, h1: _offsets(
                 *shares,
