@@ -252,11 +252,8 @@ def _middle(maps: Maps) -> tuple[float, float]:
 
 
 def motions_of(flight: Flight, compass_yaw_rad: list[float | None] | None = None) -> list[Motion]:
-    """The flight's motions; without odometry a trusted compass also says how the body turned between frames."""
-    steps = motions(flight.odometry, flight.times_s, compass_yaw_rad=compass_yaw_rad)
-    if flight.odometry is None and compass_yaw_rad is not None:
-        steps = [replace(m, yaw_rad=m.compass_yaw_rad) for m in steps]
-    return steps
+    """The flight's motions, with what a trusted compass says of each frame."""
+    return motions(flight.odometry, flight.times_s, compass_yaw_rad=compass_yaw_rad)
 
 
 def _source_of(flight: Flight) -> str:

@@ -173,6 +173,57 @@ def test_without_odometry_the_status_is_honest() -> None:
     assert all(e.status in ("converged", "ambiguous", "lost") for e in estimates)
 
 
+def test_without_odometry_a_compass_stands_for_the_yaw() -> None:
+    # The belief's heading is then counted from the map's axes and lives on from frame to frame.
+    f = flight(odometry=False, missed=0.05)
+    compass = [replace(m, compass_yaw_rad=float(a) + 0.05) for m, a in zip(f.motions[:5], f.yaw)]
+    explicit = [replace(m, yaw_rad=m.compass_yaw_rad) for m in compass]
+    settings = replace(QUICK, odometry=OdometrySettings(max_speed_m_s=8.0))
+    one, two = (make_matcher("mask", GROUND, settings) for _ in range(2))
+    for i in range(5):
+        a, b = one.step(f.views[i], compass[i]), two.step(f.views[i], explicit[i])
+        # A yaw given as the odometry's own says the same, but for where the belief counts it from.
+        assert a.status == b.status
+        np.testing.assert_allclose(a.mean, b.mean, atol=1e-6)
+        assert a.mass == pytest.approx(b.mass)
+        assert a.yaw_rad == pytest.approx(b.yaw_rad)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["mask", "ratio"])
+def test_odometry_without_a_yaw_takes_it_from_the_compass(method: str) -> None:
+    f = flight(missed=0.05)
+    yawless = [replace(m, yaw_rad=None) for m in f.motions]
+    compass = [replace(m, compass_yaw_rad=float(a)) for m, a in zip(yawless, f.yaw)]
+    error = {}
+    for name, motions in (("none", yawless), ("compass", compass)):
+        matcher = make_matcher(method, GROUND, QUICK)
+        estimates = run(matcher, replace(f, motions=motions))
+        error[name] = errors(f, estimates)
+        assert np.nan_to_num(error[name]).max() < 50
+        for e, yaw in zip(estimates, f.yaw):
+            # The yaw is the compass's where there is one, and unknown where there is none.
+            close = abs(np.angle(np.exp(1j * (e.yaw_rad - yaw)))) < 0.3
+            assert close if name == "compass" else e.t_s == 0 or math.isnan(e.yaw_rad)
+    if method == "mask":
+        assert np.isfinite(error["compass"]).mean() > 0.4
+        assert np.nanmax(error["compass"]) < 5
+
+
+def test_a_frame_whose_heading_means_something_else_forgets_it() -> None:
+    # Two frames without odometry, then odometry whose frame is turned by 2 radians against the map.
+    f = flight(missed=0.05, odometry_yaw=2.0)
+    motions = [
+        Motion(m.dt_s, None, None, 0.0, float(a)) if i < 2 else m
+        for i, (m, a) in enumerate(zip(f.motions, f.yaw))
+    ]
+    matcher = make_matcher("mask", GROUND, QUICK)
+    estimates = run(matcher, replace(f, motions=motions))
+    error = errors(f, estimates)
+    assert np.nan_to_num(error).max() < 5
+    assert np.isfinite(error[-5:]).all()
+
+
 @pytest.mark.slow
 def test_unknown_ground_gives_no_false_fix() -> None:
     building = GROUND.building.copy()
