@@ -11,7 +11,7 @@ STAMP  := $(VENV)/.installed
 BRMGEO := $(BIN)/brmgeo
 export SCHEDULER
 
-.PHONY: help setup maps tiles status localize evaluate demo test test-slow qgis-test bench bench-odometry lint check clean
+.PHONY: help setup maps tiles train status localize evaluate demo test test-slow qgis-test bench bench-odometry lint check clean
 
 help:  ## List these commands
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-14s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -31,6 +31,9 @@ maps: setup  ## Build all maps of REGION (default demo): footprints, imagery, bu
 
 tiles: setup  ## Cut training tiles of REGION (or of REGIONS="a b c"); ARGS=--align moves labels onto the imagery
 	@$(BRMGEO) tiles $(if $(REGIONS),$(REGIONS),$(REGION)) $(ARGS)
+
+train: setup  ## Train a U-Net on generated regions (minutes, CPU) and test it on REGION; RECIPE=shipped: the shipped weights
+	@$(BRMGEO) train $(REGION) $(if $(RECIPE),--recipe $(RECIPE)) $(ARGS)
 
 status: setup  ## Show which stages of REGION are fresh, and why the others are not
 	@$(BRMGEO) status $(REGION)

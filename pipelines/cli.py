@@ -230,6 +230,60 @@ def tiles(
         job.cut_region(region, data, out, scheduler, split, gsd_m, align)
 
 
+@cli.command()
+@click.argument("region", required=False)
+@data_option
+@click.option(
+    "--recipe",
+    default="short",
+    show_default=True,
+    help="A recipe of data/recipes by name, or the path of one: what is trained, on what, how.",
+)
+@click.option(
+    "--source",
+    "sources",
+    metavar="NAME=PATH",
+    multiple=True,
+    help="The folder of a source that the recipe names; repeatable.",
+)
+@click.option(
+    "--out", type=DATA, help="Where results go (default data/out/REGION/unet, or data/out/RECIPE/unet)."
+)
+@click.option("--steps", type=click.IntRange(min=1), help="Train this many steps, in place of the recipe's.")
+@click.option("--threads", type=click.IntRange(min=1), help="Processor threads (default: all).")
+def train(
+    region: str | None,
+    data: Path,
+    recipe: str,
+    sources: tuple[str, ...],
+    out: Path | None,
+    steps: int | None,
+    threads: int | None,
+) -> None:
+    """Train the U-Net by a recipe, and test it on REGION, which it never trains on. A killed run is taken up again."""
+    from pipelines import network as job
+
+    path = Path(recipe)
+    if path.suffix != ".toml":
+        path = data / "recipes" / f"{recipe}.toml"
+    folders: dict[str, Path] = {}
+    for text in sources:
+        name, sign, folder = text.partition("=")
+        if not (name and sign and folder):
+            raise SettingsError(f"train --source {text}: give NAME=PATH, such as kampala=../kampala")
+        folders[name] = Path(folder)
+    job.train(
+        path,
+        data,
+        out or data / "out" / (region or path.stem) / "unet",
+        paths=folders,
+        test_regions=(region,) if region else (),
+        steps=steps,
+        threads=threads,
+        say=click.echo,
+    )
+
+
 @cli.command("new-region")
 @click.argument("name")
 @data_option

@@ -71,8 +71,9 @@ class _Spec(BaseModel):
 class SourceSpec(_Spec):
     """One source of a recipe; see the head of this file for the kinds.
 
-    ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation. ``tiles`` that
-    are for training take their regions' own train and validation splits. ``weight``: how often it is drawn in training.
+    ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation.
+    ``tiles`` that are for training take their regions' own train and validation splits. ``weight``: how often the
+    source is drawn in training.
     """
 
     name: str
@@ -91,7 +92,7 @@ class SourceSpec(_Spec):
 
 
 class Recipe(_Spec):
-    """A training run as a file: what is trained, on what, how. ``work_gsd_m``: pictures of untrained GSDs are resampled to it."""
+    """A training run as a file: what is trained, on what, how. ``work_gsd_m``: what pictures of other GSDs are resampled to."""
 
     title: str
     work_gsd_m: Annotated[float, Field(gt=0, le=2)]
@@ -119,7 +120,7 @@ def read_recipe(path: Path) -> Recipe:
 
 
 def generated_scene(seed: int, size_m: float, gsd_m: float, day: int, cache: Path) -> Scene:
-    """A town of ``size_m`` square that ``TownStyle.varied(seed)`` styles, painted at ``gsd_m``; ``day`` > 0 is another season.
+    """A town of ``size_m`` square in the style ``TownStyle.varied(seed)``, at ``gsd_m``; ``day`` > 0: another season.
 
     Painted once and kept in ``cache`` under the digest of what it was made from.
     """
@@ -178,8 +179,8 @@ def read_pairs(folder: Path) -> tuple[list[str], list[U8], list[U8]]:
 def xyz_scenes(folder: Path, zoom: int, validation_share: float) -> tuple[list[Scene], list[Scene]]:
     """(train, validation) scenes put together from tiles named ...X-Y-Z; one scene for every group of tiles that touch.
 
-    The western columns of the largest group are the validation scene, about ``validation_share`` of it; the column next to them
-    belongs to neither. Raises as ``read_pairs``, and InputError where no name holds X-Y-``zoom``.
+    The western columns of the largest group, about ``validation_share`` of it, are the validation scene; the column next
+    to them belongs to neither. Raises as ``read_pairs``, and InputError where no name holds X-Y-``zoom``.
     """
     names, images, labels = read_pairs(folder)
     tiles: dict[tuple[int, int], tuple[U8, U8]] = {}
@@ -275,13 +276,13 @@ def gather(
     """The sources of a recipe, read or made.
 
     Args:
-        paths: name of a source -> its folder, for those of the kinds pairs, xyz and flight. A test source whose folder is not
-            given is left out; a training source must be there.
+        paths: name of a source -> its folder, for those of the kinds pairs, xyz and flight. A test source whose
+            folder is not given is left out; a training source must be there.
         test_regions: regions to test on besides the recipe's own.
         finest_m: the finest GSD of any crop: what is much finer is averaged down once, here.
 
-    Raises MissingInputError and InputError as the readers do, SettingsError for a path that no source asks for and for regions that
-    must not be trained on.
+    Raises MissingInputError and InputError as the readers do, SettingsError for a path that no source asks for
+    and for regions that must not be trained on.
     """
     names = {s.name for s in recipe.source if s.kind in ("pairs", "xyz", "flight")}
     for name in paths:

@@ -95,7 +95,9 @@ class Source(Protocol):
         ...
 
 
-def draw_crop(source: Source, rng: np.random.Generator, size_px: int, settings: AugmentSettings) -> tuple[U8, U8]:
+def draw_crop(
+    source: Source, rng: np.random.Generator, size_px: int, settings: AugmentSettings
+) -> tuple[U8, U8]:
     """One training crop: ((size, size, 3) uint8 RGB, (size, size) uint8 label), from ``source`` and ``rng`` alone."""
     low, high = settings.gsd_m
     gsd = float(math.exp(rng.uniform(math.log(low), math.log(high))))
@@ -169,9 +171,10 @@ def cut(
 
 
 def shrunk(image: U8, label: U8, k: int) -> tuple[U8, U8]:
-    """(h / k, w / k, 3) and (h / k, w / k) uint8: means of blocks of k x k pixels; what is left over right and below is cut off.
+    """(h / k, w / k, 3) and (h / k, w / k) uint8: means of blocks of k x k pixels.
 
-    A block is building when at least half of its pixels are, unknown when any is.
+    What is left over at the right and below is cut off. A block is building when at least half of its pixels are,
+    unknown when any is.
     """
     if k == 1:
         return image, label
@@ -196,9 +199,7 @@ def _window(image: U8, label: U8, top: int, left: int, bottom: int, right: int) 
     border = (max(-top, 0), max(bottom - h, 0), max(-left, 0), max(right - w, 0))
     if any(border):
         part = np.asarray(cv2.copyMakeBorder(part, *border, cv2.BORDER_REFLECT), np.uint8)
-        known = np.asarray(
-            cv2.copyMakeBorder(known, *border, cv2.BORDER_CONSTANT, value=UNKNOWN), np.uint8
-        )
+        known = np.asarray(cv2.copyMakeBorder(known, *border, cv2.BORDER_CONSTANT, value=UNKNOWN), np.uint8)
     return part, known
 
 
@@ -253,13 +254,21 @@ def _roofs(img: F32, label: U8, rng: np.random.Generator) -> F32:
 
 
 _FLAT = np.array(  # tennis blue and green, clay, pool, asphalt, concrete, turf
-    [(58, 104, 168), (70, 120, 88), (168, 96, 72), (120, 204, 214), (92, 92, 94), (188, 184, 174), (92, 140, 70)],
+    [
+        (58, 104, 168),
+        (70, 120, 88),
+        (168, 96, 72),
+        (120, 204, 214),
+        (92, 92, 94),
+        (188, 184, 174),
+        (92, 140, 70),
+    ],
     np.float32,
 )
 
 
 def _objects(img: F32, label: U8, gsd_m: float, rng: np.random.Generator) -> F32:
-    """Flat things that are no building: courts with their lines, pools, paved squares with cars, where the ground is open."""
+    """Flat things that are no building, where the ground is open: courts with their lines, pools, paved squares, turf."""
     h, w = label.shape
     img = img.copy()
     free = cv2.distanceTransform((label == 0).astype(np.uint8), cv2.DIST_L2, 3)

@@ -73,7 +73,10 @@ class Scores:
     @property
     def boundary_f1(self) -> float:
         """Harmonic mean of the shares of both outlines that lie within the tolerance of the other."""
-        p, r = _share(self.edge_estimate_hit, self.edge_estimate), _share(self.edge_label_hit, self.edge_label)
+        p, r = (
+            _share(self.edge_estimate_hit, self.edge_estimate),
+            _share(self.edge_label_hit, self.edge_label),
+        )
         return 2 * p * r / (p + r) if p + r > 0 else 0.0
 
     @property
@@ -107,7 +110,9 @@ def segmentation_scores(
     Raises ValueError for arrays of different shapes.
     """
     if probability.shape != label.shape:
-        raise ValueError(f"a probability of {probability.shape} and a label of {label.shape} are not of one frame")
+        raise ValueError(
+            f"a probability of {probability.shape} and a label of {label.shape} are not of one frame"
+        )
     known = label != UNKNOWN
     truth = label == BUILDING
     estimate = (probability > threshold) & known
@@ -169,8 +174,8 @@ def ring_features(mask: NDArray[np.bool_], known: NDArray[np.bool_], n: int = 3)
 class LogitHistogram:
     """How often each logit was given to buildings and to other ground; all that calibration and threshold need.
 
-    ``add`` frames of validation, then ``temperature``, ``best_threshold`` and ``reliability``. Logits beyond +-``LIMIT`` count as
-    that; bins are 0.05 wide, so what follows is exact to 0.6 % of probability.
+    ``add`` frames of validation, then ``temperature``, ``best_threshold`` and ``reliability``. Logits beyond +-``LIMIT``
+    count as that; bins are 0.05 wide, so what follows is exact to 0.6 % of probability.
     """
 
     LIMIT = 16.0
@@ -181,7 +186,9 @@ class LogitHistogram:
     def add(self, logits: F32, label: U8) -> None:
         """Counts the known pixels of (h, w) float32 logits and their uint8 label; NaN logits are left out."""
         usable = np.isfinite(logits) & (label != UNKNOWN)
-        index = np.floor((np.clip(logits[usable], -self.LIMIT, self.LIMIT - 1e-6) + self.LIMIT) / 0.05).astype(int)
+        index = np.floor(
+            (np.clip(logits[usable], -self.LIMIT, self.LIMIT - 1e-6) + self.LIMIT) / 0.05
+        ).astype(int)
         truth = label[usable] == BUILDING
         self.building += np.bincount(index[truth], minlength=self.BINS)[: self.BINS]
         self.other += np.bincount(index[~truth], minlength=self.BINS)[: self.BINS]
@@ -218,7 +225,9 @@ class LogitHistogram:
         probability = 1 / (1 + np.exp(-edge / temperature))
         return float(np.clip(probability[int(np.argmax(iou))], 0.01, 0.99))
 
-    def reliability(self, temperature: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def reliability(
+        self, temperature: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """(mean probability, share of building, pixels) of RELIABILITY_BINS equal bins of probability; NaN in empty ones."""
         p = 1 / (1 + np.exp(-self.logits / temperature))
         both = self.building + self.other

@@ -154,7 +154,9 @@ class Mixture:
 
     def __init__(self, sources: Sequence[Source], weights: Sequence[float]) -> None:
         if not sources or len(sources) != len(weights) or min(weights) <= 0:
-            raise InputError(f"{len(sources)} sources with the weights {list(weights)}: give one above 0 for each")
+            raise InputError(
+                f"{len(sources)} sources with the weights {list(weights)}: give one above 0 for each"
+            )
         self._sources, self._odds = list(sources), np.array(weights) / sum(weights)
 
     def patch(self, rng: np.random.Generator, reach_m: float, near_buildings: float) -> Patch:
@@ -164,7 +166,7 @@ class Mixture:
 
 
 def blank_unknown(image: U8, label: U8, least_px: int = 12) -> U8:
-    """The label with 127 where the picture is a plain white or black area of ``least_px`` or more across: nothing was seen."""
+    """The label with 127 where the picture is plain white or black over ``least_px`` or more: nothing was seen there."""
     out = label.copy()
     for value in (0, 255):
         plain = (image == value).all(-1).astype(np.uint8)

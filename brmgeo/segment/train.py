@@ -201,7 +201,9 @@ class Trainer:
         what = {
             "unet": unet.plain(),
             "settings": {
-                k: v for k, v in asdict(settings).items() if k not in ("threads", "device", "checkpoint_steps")
+                k: v
+                for k, v in asdict(settings).items()
+                if k not in ("threads", "device", "checkpoint_steps")
             },
             "augment": asdict(augment),
             "data": data,
@@ -242,12 +244,14 @@ class Trainer:
         return run
 
     def train(
-        self, on_epoch: Callable[[Run, F32], None] | None = None, on_step: Callable[[int, float], None] | None = None
+        self,
+        on_epoch: Callable[[Run, F32], None] | None = None,
+        on_step: Callable[[int, float], None] | None = None,
     ) -> Run:
         """Trains to the last step or until patience runs out, from the checkpoint where there is one.
 
-        ``on_epoch(run, probability)`` is called after every epoch with the validation crops' (n, s, s) probabilities, before the
-        epoch is written to the checkpoint; ``on_step(step, loss)`` after every step.
+        ``on_epoch(run, probability)`` is called after every epoch, before its checkpoint is written, with the validation
+        crops' (n, s, s) probabilities; ``on_step(step, loss)`` after every step.
         """
         s = self._settings
         run = self.start()
@@ -274,9 +278,7 @@ class Trainer:
         run.optimiser.zero_grad(set_to_none=True)
         total = 0.0
         for part in range(s.accumulate):
-            images, labels = batch_of(
-                self._source, s.seed, run.step, part, s.batch, s.crop_px, self._augment
-            )
+            images, labels = batch_of(self._source, s.seed, run.step, part, s.batch, s.crop_px, self._augment)
             x = torch.from_numpy(normalised(images)).to(self.device, memory_format=torch.channels_last)
             with self._precision():
                 logits = run.model(x)
@@ -339,7 +341,9 @@ class Trainer:
         for part, state in parts.items():
             tensors |= {f"{part}/{name}": t.detach().cpu().contiguous() for name, t in state.items()}
         for number, state in run.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser/{number}/{name}": t.detach().cpu().contiguous() for name, t in state.items()}
+            tensors |= {
+                f"optimiser/{number}/{name}": t.detach().cpu().contiguous() for name, t in state.items()
+            }
         # Shared storage (a state and its copy) is refused by safetensors: each tensor gets its own.
         tensors = {name: t.clone() for name, t in tensors.items()}
         facts = {
@@ -401,7 +405,7 @@ def _part(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
 def validation_crops(
     sources: Sequence[Source], each: int, crop_px: int, gsd_m: float, seed: int = 0
 ) -> tuple[U8, U8]:
-    """(n, s, s, 3) and (n, s, s) uint8: ``each`` unchanged crops at ``gsd_m`` out of every source, the same for the same seed."""
+    """(n, s, s, 3) and (n, s, s) uint8: ``each`` unchanged crops at ``gsd_m`` of every source, the same for a seed."""
     plain = AugmentSettings.none(gsd_m)
     parts = [batch_of(source, seed, 0, k, each, crop_px, plain) for k, source in enumerate(sources)]
     return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
@@ -420,7 +424,7 @@ def _evaluating(net: UNet) -> Iterator[None]:
 
 def predict(net: UNet, images: U8) -> F32:
     """(n, h, w) float32 logits of (n, h, w, 3) uint8 RGB of any size: mirrored at the edges up to what the U-Net takes."""
-    n, h, w, _ = images.shape
+    _, h, w, _ = images.shape
     multiple = net.settings.multiple_px
     pad = ((0, 0), (0, -h % multiple), (0, -w % multiple), (0, 0))
     x = normalised(np.pad(images, pad, mode="symmetric"))

@@ -110,7 +110,9 @@ def test_frames_without_buildings_are_scored() -> None:
     label = np.zeros((20, 20), np.uint8)
     scores = segmentation_scores(np.full((20, 20), np.nan, np.float32), label, 0.5, 0.3)
     assert (scores.accuracy, scores.iou, scores.feature_mae) == (1.0, 1.0, 0.0)
-    assert math.isnan(segmentation_scores(np.zeros((4, 4), np.float32), np.full((4, 4), 127, np.uint8), 0.5, 1).feature_mae)
+    assert math.isnan(
+        segmentation_scores(np.zeros((4, 4), np.float32), np.full((4, 4), 127, np.uint8), 0.5, 1).feature_mae
+    )
 
 
 def test_shapes_must_agree() -> None:
@@ -132,7 +134,9 @@ def overconfident() -> tuple[LogitHistogram, np.ndarray, np.ndarray]:
     return histogram, logits, truth
 
 
-def test_temperature_undoes_overconfidence(overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray]) -> None:
+def test_temperature_undoes_overconfidence(
+    overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray],
+) -> None:
     histogram, logits, truth = overconfident
     temperature = histogram.temperature()
     assert temperature == pytest.approx(2.5, abs=0.05)
@@ -143,7 +147,9 @@ def test_temperature_undoes_overconfidence(overconfident: tuple[LogitHistogram, 
     assert histogram.entropy(2.0) == pytest.approx(exact, abs=1e-3)
 
 
-def test_threshold_is_that_of_the_best_iou(overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray]) -> None:
+def test_threshold_is_that_of_the_best_iou(
+    overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray],
+) -> None:
     histogram, logits, truth = overconfident
     p = 1 / (1 + np.exp(-logits / 2.5))
 
