@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import shutil
 import sys
@@ -22,12 +23,15 @@ import rasterio
 from affine import Affine
 from rasterio.enums import ColorInterp
 
-from brmgeo.segment.predict import Segmenter
+from brmgeo.match.likelihood import RateLearner
+from brmgeo.match.register import Registrar
+from brmgeo.segment.predict import SHIPPED, Segmenter
+from pipelines import flights
 from pipelines import masks as job
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "segment"))
 from small_networks import bright_onnx, small_card
-from test_flights import CRS, Said, bytes_of, make_flight, maps, say, waypoints
+from test_flights import CRS, REAL, Said, bytes_of, make_flight, maps, real_maps, say, waypoints
 
 Say = Callable[..., Said]
 
@@ -448,3 +452,33 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
         in say("segment", whole, "--weights", weights, "--out", out, "--levels", "9,3").line
     )
     assert not [p for p in os.listdir(tmp_path) if p.startswith(".")]
+
+
+# ---------------------------------------------------------------- the real flight
+
+
+@pytest.mark.skipif(not SHIPPED.is_file(), reason="no weights have been shipped yet")
+def test_every_real_frame_registers_on_the_map_by_the_shipped_network(
+    real_maps: Path, tmp_path: Path
+) -> None:
+    """The whole chain on a real flight that the network was never trained on: pictures, masks, registration."""
+    built, flight = flights.read_maps(real_maps), job.read_flight(REAL)
+    reference = flight.reference(built.crs)
+    assert reference is not None
+    truth = reference.at(flight.times_s)
+    yaws = flight.compass_yaw_rad(built.crs, *truth[0])
+    rates = RateLearner(flights.match_settings(flights.FlightSettings()).rates).rates
+    registrar = Registrar(built.ground)
+    use = job.NetworkUse(wanted="network", cache=tmp_path)
+    apart = []
+    with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
+        for i, (xy, yaw) in enumerate(zip(truth, yaws, strict=True)):
+            given = flights.view_at(flight, built.ground.gsd_m, i)
+            if given.building.sum() * given.gsd_m**2 < 20.0:
+                continue  # no roof in sight
+            view = flights.view_at(flight, built.ground.gsd_m, i, masks)
+            assert yaw is not None
+            found = registrar.register(view, np.array([*xy, yaw]), 10.0, 0.1, rates)
+            apart.append(10.0 if found is None else math.dist(found.pose[:2], xy))
+    assert len(apart) >= 75
+    assert np.median(apart) < 2.0, np.percentile(apart, [25, 50, 75, 90])
