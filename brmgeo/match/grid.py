@@ -74,6 +74,7 @@ class GridMatcher(ABC):
         self._misses = 0
         self._off_frames = 0
         self._confirmed = False
+        self._fits: list[float] = []
         self._frame: Frame = "odometry"
         self._unfixed_searches = 0
         self._since_informed_m = 0.0
@@ -119,9 +120,9 @@ class GridMatcher(ABC):
         """Error per axis that stays the same from frame to frame, metres: levelling, and what the method adds."""
         return math.hypot(self.settings.odometry.attitude_sigma_rad * view.agl_m, self._systematic())
 
-    def _least_fit(self) -> float:
-        """How well a measured pose must fit before there is a first fix; 0 when none is needed."""
-        return 0.0
+    @abstractmethod
+    def _least_fit(self) -> tuple[float, int]:
+        """How well measured poses must fit before there is a first fix, in the mean of so many successive frames."""
 
     @abstractmethod
     def _learn(self, view: View, anchor: Anchor) -> None:
@@ -269,6 +270,8 @@ class GridMatcher(ABC):
         cov = np.array([[c, cross], [cross, r]]) * self.cell_m**2
         heading, heading_sigma = mode.heading_rad, mode.heading_sigma_rad
         sure = mode.mass > s.converged_mass
+        if not sure:
+            self._fits.clear()
         if sure:
             mean, cov, heading, heading_sigma = self._follow(view, motion, mean, cov, heading, heading_sigma)
         elif mode.mass < 0.5:
@@ -278,7 +281,7 @@ class GridMatcher(ABC):
         # What lasts the whole flight is averaged away by no filter.
         cov = cov + np.eye(2) * self._lasting_m(view) ** 2
         sigma = math.sqrt(float(np.trace(cov)) / 2.0)
-        if sure and sigma <= s.converged_sigma_m and (self._confirmed or self._least_fit() <= 0):
+        if sure and sigma <= s.converged_sigma_m and self._confirmed:
             status = "converged"
             self._unfixed_searches = 0
         else:
@@ -341,7 +344,7 @@ class GridMatcher(ABC):
             if d2 < 16.3 or fresh:
                 track.update(anchor.pose, anchor.covariance, turn)
                 self._misses = 0
-                self._confirmed |= anchor.fit >= self._least_fit()
+                self._confirmed |= self._fits_well(anchor.fit)
                 if self._confirmed:
                     self._anchors[-1] = anchor
                     self._learn(view, anchor)
@@ -359,6 +362,13 @@ class GridMatcher(ABC):
         if motion.step_m is None and body is None:
             self.track = None
         return result
+
+    def _fits_well(self, fit: float) -> bool:
+        # A view of next to no building has no fit, good or bad.
+        if not math.isnan(fit):
+            self._fits.append(fit)
+        least, frames = self._least_fit()
+        return len(self._fits) >= frames and float(np.mean(self._fits[-frames:])) >= least
 
     # After the flight
 

@@ -45,8 +45,8 @@ class MaskMatcher(GridMatcher):
     def _systematic(self) -> float:
         return self.settings.rates.systematic_sigma_m
 
-    def _least_fit(self) -> float:
-        return self.settings.rates.least_fit
+    def _least_fit(self) -> tuple[float, int]:
+        return self.settings.rates.least_fit, 1
 
     def _evidence(self, view: View) -> tuple[float, float]:
         return float(np.count_nonzero(view.known)) * view.gsd_m**2, self.settings.rates.repeat

@@ -48,6 +48,9 @@ class RatioMatcher(GridMatcher):
     def _evidence(self, view: View) -> tuple[float, float]:
         return math.pi * view.radius_m**2, self.settings.ratio.repeat
 
+    def _least_fit(self) -> tuple[float, int]:
+        return self.settings.ratio.least_fit, 2
+
     def _look(self, view: View) -> None:
         self._rings = view_rings(view, self.settings.ratio.radii)
 
@@ -182,7 +185,27 @@ class RatioMatcher(GridMatcher):
         gain = np.maximum(gain, 1e-4)
         info = axes @ np.diag(gain) @ axes.T
         place = pose[:2] + np.linalg.solve(info, post @ mean)
+        at = int(np.abs(y - mean[1]).argmin()), int(np.abs(x - mean[0]).argmin())
+        fit = ring_fit(rings, np.array([b[at] for b in built]), np.array([k[at] for k in known]))
         full = np.zeros((3, 3))
         full[:2, :2] = np.linalg.inv(info)
         full[2, 2] = math.pi**2
-        return Anchor(np.array([*place, pose[2]]), full)
+        return Anchor(np.array([*place, pose[2]]), full, fit)
+
+
+def ring_fit(rings: Rings, built: NDArray[np.floating], known: NDArray[np.floating]) -> float:
+    """How far the building in a view's rings and in the map's agree, as Dice of areas, in [0, 1]; NaN for too little of it.
+
+    Args:
+        rings: of the view.
+        built, known: (n,) square metres of building and of known ground in the map's discs of the rings' radii.
+
+    At the true place it is about 0.95, at the best of all wrong places on a map of the same kind of town about 0.75
+    (docs/matchers.md); views with less than 2 % of building say nothing.
+    """
+    inside, seen = np.diff(built, prepend=0.0), np.diff(known, prepend=0.0)
+    share = np.divide(inside, seen, out=np.zeros(len(inside)), where=seen > 0)
+    area = np.where(seen > 0, rings.area_m2, 0.0)
+    if not area.sum() or float((rings.share * area).sum()) < 0.02 * float(area.sum()):
+        return math.nan
+    return 1.0 - float((np.abs(rings.share - share) * area).sum() / ((rings.share + share) * area).sum())

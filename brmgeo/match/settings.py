@@ -186,6 +186,8 @@ class RatioSettings:
         dof: degrees of freedom of the Student likelihood of one ring, [1, 100].
         independent_m2: as in ``RateSettings``, for the scatter of a ring's ratio, square metres, [1, 1e5].
         repeat: as in ``RateSettings``, [0.1, 100].
+        least_fit: the first fix needs two successive views whose rings hold the building that the map's rings hold (Dice
+            of areas, mean of the two), [0, 1].
     """
 
     radii: int = 8
@@ -194,6 +196,7 @@ class RatioSettings:
     dof: float = 5.0
     independent_m2: float = 300.0
     repeat: float = 5.0
+    least_fit: float = 0.9
 
     def __post_init__(self) -> None:
         _check(
@@ -204,6 +207,7 @@ class RatioSettings:
             dof=(1, 100),
             independent_m2=(1, 1e5),
             repeat=(0.1, 100),
+            least_fit=(0, 1),
         )
 
 
