@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -65,9 +66,9 @@ PAIRS_A_SHARD = 512
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192
 ARROW = 20.0
-ALIGN_BLOCK_M = 250.0
-ALIGN_SEARCH_M = 10.0
-ALIGN_GSD_M = 0.25  # finer pixels tell no more of outlines drawn to a decimetre or worse
+# Blocks in which offsets are measured, how far they are looked for, and in what pixels: finer ones tell no more of outlines
+# that are drawn to a decimetre or worse.
+ALIGN = {"block_m": 250.0, "least_block_m": 100.0, "search_m": 10.0, "gsd_m": 0.25}
 ALIGN_COARSEST_M = 1.2  # a house of eight pixels has edges, one of four has not
 
 
@@ -81,10 +82,12 @@ def run_alignment(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
 
     box, _ = read_lattice(inputs["lattice"])
     left, bottom, right, top = bounds_of(box)
-    gsd_m = max(ALIGN_GSD_M, native_gsd_m(_sources(inputs, settings), box))
-    places = cells((left, bottom, right, top), ALIGN_BLOCK_M)
+    gsd_m = max(settings["gsd_m"], native_gsd_m(_sources(inputs, settings), box))
+    # A small region is cut into smaller blocks, so that a few of them can agree.
+    wanted = max(settings["least_block_m"], math.sqrt((right - left) * (top - bottom) / 16))
+    places = cells((left, bottom, right, top), min(settings["block_m"], wanted))
     side = min(places[0][2] - places[0][0], places[0][3] - places[0][1])
-    search_m = min(ALIGN_SEARCH_M, side / 4 - gsd_m)
+    search_m = min(settings["search_m"], side / 4 - gsd_m)
     found: list[BlockOffset] = []
     if gsd_m <= ALIGN_COARSEST_M and search_m > 2 * gsd_m:
         work = functools.partial(_block_offset, dict(inputs), json.dumps(settings), gsd_m, search_m)
@@ -513,7 +516,7 @@ def plan_tiles(
     }
     box = lattice(maps._place(region), region.crs, region.gsd_m)
     source = imagery.settings["source"]
-    alignment = plan.add(ALIGNMENT, inputs, {"source": source})
+    alignment = plan.add(ALIGNMENT, inputs, {"source": source, **ALIGN})
     if align:
         inputs["alignment"] = alignment
     cut = {"region": region.name, "source": source, "tile_px": own.tile_px, "align": align}
@@ -732,9 +735,9 @@ def _publish(made: Mapping[str, Artifact], names: Mapping[str, str], out: Path) 
     publish(index, out, sorted(index.record["outputs"]))
     if "alignment" in made:
         publish(made["alignment"], out, ["alignment.json"])
-    for stale in out.glob("*.tar"):
+    for stale in out.glob(f"{index.step.settings['region']}-*.tar"):
         if stale.name not in wanted:
-            stale.unlink()
+            stale.unlink()  # of an earlier cut with other settings
 
 
 # --- pairs: images and masks of others ------------------------------------------------------------------------------
