@@ -63,7 +63,7 @@ from pipelines.masks import (
     slant_gsd_m,
 )
 from pipelines.odometry import odometry_name, own_odometry
-from pipelines.regions import region_named
+from pipelines.regions import region_named, town_style
 
 FloatArray = NDArray[np.float64]
 CANDIDATES_A_FRAME = 20_000
@@ -732,7 +732,8 @@ def other_day(own: Region, maps_dir: Path, season: str, seed: int, out: Path) ->
         )
     assert own.bounds is not None
     box = box_of(maps_dir / "buildings.tif")
-    town = generate_town(own.bounds, own.generate.seed, crs=own.crs)
+    style = town_style(own.generate.style, own.generate.season)
+    town = generate_town(own.bounds, own.generate.seed, style, own.crs)
     picture = render_imagery(another_day(town, season, seed), box)  # type: ignore[arg-type]
     write_cog(out, (picture, np.ones(picture.shape[:2], bool)), box, kind="imagery")
     return out
