@@ -704,7 +704,7 @@ def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None,
     if survey["gsd_too_fine_m"]:
         progress.say(
             f"{region.name}: nothing cut at {maps._listed([f'{g:g} m' for g in survey['gsd_too_fine_m']])}: much finer than "
-            f"the imagery's {survey['imagery_gsd_m']:g} m per pixel"
+            f"the imagery's {survey['imagery_gsd_m']:.3g} m per pixel"
         )
     offset = made["alignment"].facts
     if offset["status"] == "told":
