@@ -5,13 +5,20 @@
 Masks-only flights along the paper's rectangle over built-up ground, with odometry like VINS-Mono's. With ``--off-map`` all
 buildings within 250 m of each path are taken out of the map first: no fix may come of that. Without
 ``--footprints`` the real sheet in BRMGEO_REAL_DATA (default ../shared/data) is used where present, else a generated town.
+
+    python benchmarks/matchers.py --large 30 [--frames 6] [--methods mask ratio]
+
+The same ground at 1 m, moved and mirrored, fills a map of 30 x 30 km in which it lies as it is once; the first frames of
+one flight over it: time of the first and the later steps, listed blocks, and the process's peak memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import multiprocessing
 import os
+import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -67,6 +74,45 @@ def without_surroundings(ground: GroundMap, xy: Any, margin_m: float = 250.0) ->
     cols = slice(max(0, int((x0 - ground.left) / g)), max(0, int((x1 - ground.left) / g)))
     mask[rows, cols] = 0
     return GroundMap(mask, ground.left, ground.top, g)
+
+
+def large_map(ground: GroundMap, side_km: float, seed: int = 0) -> GroundMap:
+    """The ground at 1 m in the middle of a square map, which copies of it fill: moved round, two in three mirrored."""
+    one = ground.building[:: round(1.0 / GSD_M), :: round(1.0 / GSD_M)]
+    (h, w), n = one.shape, round(side_km * 1000)
+    building = np.zeros((n, n), np.uint8)
+    rng = np.random.default_rng(seed)
+    middle = (n // h // 2, n // w // 2)
+    for r in range(-(-n // h)):
+        for c in range(-(-n // w)):
+            copy = one
+            if (r, c) != middle:
+                flips = ((1, 1), (-1, 1), (1, -1))[rng.integers(3)]
+                copy = np.roll(one[:: flips[0], :: flips[1]], rng.integers(0, min(h, w), 2), (0, 1))
+            part = building[r * h : (r + 1) * h, c * w : (c + 1) * w]
+            part[:] = copy[: part.shape[0], : part.shape[1]]
+    return GroundMap(building, ground.left - middle[1] * w, ground.top + middle[0] * h, 1.0)
+
+
+def large(method: str, ground: GroundMap, flight: SimulatedViews, side_km: float, frames: int) -> str:
+    """One line of the large map's table, measured in this process."""
+    wide = large_map(ground, side_km)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    cpu, wall, blocks = [time.process_time()], [time.perf_counter()], []
+    matcher = make_matcher(method, wide)
+    cpu.append(time.process_time())
+    wall.append(time.perf_counter())
+    for view, motion in zip(flight.views[:frames], flight.motions):
+        estimate = matcher.step(view, motion)
+        cpu.append(time.process_time())
+        wall.append(time.perf_counter())
+        blocks.append(int(estimate.extra.get("listed_blocks", 0)))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    c, w = np.diff(cpu), np.diff(wall)
+    return (
+        f"| {method} | {side_km:g} x {side_km:g} km | {c[0]:.1f} | {c[1]:.1f} ({w[1]:.1f}) | "
+        f"{', '.join(f'{v:.2f}' for v in c[2:])} | {', '.join(map(str, blocks))} | {before / 1e6:.1f} | {peak / 1e6:.1f} |"
+    )
 
 
 def fly(method: str, ground: GroundMap, flight: SimulatedViews) -> dict[str, Any]:
@@ -133,6 +179,8 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=["mask", "ratio", "paper"])
     parser.add_argument("--off-map", action="store_true")
+    parser.add_argument("--large", type=float, metavar="KM")
+    parser.add_argument("--frames", type=int, default=6)
     options = parser.parse_args()
     sheet = options.footprints or REAL / "ngii" / "36914093_buildings.gpkg"
     if sheet.exists():
@@ -142,6 +190,17 @@ def main() -> None:
     ground, real = raster(polygons), Ground.from_polygons(polygons)
     h, w = ground.building.shape
     print(f"{sheet.name}: {w * GSD_M:.0f} x {h * GSD_M:.0f} m, seeds from {options.first_seed}\n")
+    if options.large:
+        print("| method | map | making it, CPU s | first step, CPU s (wall) | later steps, CPU s | listed blocks | "
+              "map alone, peak GB | peak GB |\n" + "|---" * 8 + "|")  # fmt: skip
+        seed = options.first_seed
+        flight = simulate_views(real, place(rectangle((0.0, 0.0), 0.0), real, seed), seed=seed)
+        for method in options.methods:
+            # A process of its own: peaks do not come down again.
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                arguments = (method, ground, flight, options.large, options.frames)
+                print(pool.apply(large, arguments), flush=True)
+        return
     print("| method | flights | first fix median m | 95 % | max | RMSE after m | smoothed m | false | converged "
           "| within 1/2/3 sigma | smoothed 2 sigma | s/step | first step s | CPU s/step |")  # fmt: skip
     print("|---" * 14 + "|")

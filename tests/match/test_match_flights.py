@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from brmgeo.match import (
     PaperSettings,
     make_matcher,
 )
+from brmgeo.match.likelihood import MapCover
 
 # Coarser than the defaults, so that the whole file takes seconds.
 QUICK = MatchSettings(belief=BeliefSettings(headings=72, cell_m=6.0))
@@ -52,6 +54,29 @@ def test_mask_fixes_early_and_keeps_the_track_with_a_scale_bias(plain) -> None: 
     assert off.max() < 4.0
     assert np.array_equal(smooth.t_s, [v.t_s for v in f.views])
     assert (smooth.sigma_m < 5).all()
+
+
+def test_the_example_of_the_docs_runs(plain) -> None:  # type: ignore[no-untyped-def]
+    f, _, _ = plain
+    text = (Path(__file__).parents[2] / "docs" / "matchers.md").read_text(encoding="utf-8")
+    code = text.split("```python\n")[1].split("```")[0]
+    frames = [
+        (v.t_s, m.dt_s, v.building, v.known, v.nadir_px, v.agl_m, v.radius_m, m.step_m, m.yaw_rad)
+        for v, m in zip(f.views[:4], f.motions)
+    ]
+    names = {
+        "building": GROUND.building,
+        "left": GROUND.left,
+        "top": GROUND.top,
+        "gsd_m": GROUND.gsd_m,
+        "frames": frames,
+    }
+    exec(compile(code, "docs/matchers.md", "exec"), names)
+    assert len(names["path"].xy) == 4
+    assert names["estimate"].t_s == f.views[3].t_s
+    for t_s, x, y, sigma_m in names["fixes"]:
+        assert math.dist((x, y), f.xy[round(t_s / 5)]) < 10
+        assert 0 < sigma_m < 15
 
 
 def test_shift_the_map_and_the_fix_shifts(plain) -> None:  # type: ignore[no-untyped-def]
@@ -222,6 +247,45 @@ def test_a_frame_whose_heading_means_something_else_forgets_it() -> None:
     error = errors(f, estimates)
     assert np.nan_to_num(error).max() < 5
     assert np.isfinite(error[-5:]).all()
+
+
+@pytest.mark.slow
+def test_work_follows_the_area_still_possible(monkeypatch: pytest.MonkeyPatch) -> None:
+    # 12 x 12 km of towns that repeat, turned and mirrored; the flight's own town stands there once.
+    tiles = [town(seed).ground(2.0).building for seed in (51, 52, 53)]
+    n = len(tiles[0])
+    rng = np.random.default_rng(4)
+    rows = []
+    for _ in range(8):
+        turned = [np.rot90(tiles[rng.integers(3)], rng.integers(4)) for _ in range(8)]
+        rows.append(np.concatenate([t[:, ::-1] if rng.random() < 0.5 else t for t in turned], axis=1))
+    building = np.ascontiguousarray(np.concatenate(rows))
+    building[:n] = 0  # open country
+    building[4 * n : 5 * n, 3 * n : 4 * n] = SCENE.ground(2.0).building
+    side = 2.0 * n
+    ground = GroundMap(building, SCENE.left - 3 * side, SCENE.bottom + 5 * side, 2.0)
+    scored = []
+    score = MapCover.score_blocks
+    monkeypatch.setattr(
+        MapCover,
+        "score_blocks",
+        lambda self, keys, a, b: (scored.append(len(keys)), score(self, keys, a, b))[1],
+    )
+    f = flight(missed=0.05)
+    matcher = make_matcher("mask", ground, QUICK)
+    work, error = [], []
+    for i in range(8):
+        scored.clear()
+        estimate = matcher.step(f.views[i], f.motions[i])
+        work.append(sum(scored))
+        assert estimate.extra["listed_blocks"] <= QUICK.belief.max_blocks
+        if estimate.position is not None:
+            error.append(math.dist(estimate.position[:2], f.xy[i]))
+    whole = 72 * matcher.belief.grid[0] * matcher.belief.grid[1]
+    assert work[0] < 0.4 * whole
+    assert work[-1] < 1e-3 * whole
+    assert error
+    assert max(error) < 5
 
 
 @pytest.mark.slow
