@@ -312,9 +312,9 @@ def new_region(
 @click.option("--verify", is_flag=True, help="Also hold the contents of all outputs against their records.")
 def status(region: str, data: Path, verify: bool) -> None:
     """Show how each stage of REGION stands: fresh, stale, missing or damaged."""
-    from pipelines import maps as job
+    from pipelines import maps, training
 
-    for line in job.status_lines(region, data, verify):
+    for line in [*maps.status_lines(region, data, verify), *training.status_lines(region, data, verify)]:
         click.echo(line)
 
 
@@ -324,9 +324,9 @@ def status(region: str, data: Path, verify: bool) -> None:
 @data_option
 def why(region: str, stage: str, data: Path) -> None:
     """Explain why STAGE of REGION would run again: which setting or input changed."""
-    from pipelines import maps as job
+    from pipelines import maps, training
 
-    for line in job.why_lines(region, stage, data):
+    for line in training.why_lines(region, stage, data) or maps.why_lines(region, stage, data):
         click.echo(line)
 
 

@@ -740,6 +740,33 @@ def _publish(made: Mapping[str, Artifact], names: Mapping[str, str], out: Path) 
             stale.unlink()  # of an earlier cut with other settings
 
 
+def status_lines(name: str, data: Path, verify: bool = False) -> list[str]:
+    """One line a stage of a region's training tiles, with a reason below each that is not fresh; none before a cut."""
+    plan = _plan_as_last_cut(name, data)
+    if plan is None:
+        return []
+    lines = []
+    for step in plan.status(verify):
+        if step.label == "alignment" or step.label.startswith("tile"):
+            lines.append(f"{step.label:<24} {step.state:<8} {step.key[:12]}")
+            lines += [f"    {reason}" for reason in step.reasons]
+    return lines
+
+
+def why_lines(name: str, stage: str, data: Path) -> list[str] | None:
+    """Why a stage of a region's training tiles would run, or that it would not; None for a stage that is none of them."""
+    plan = _plan_as_last_cut(name, data)
+    return None if plan is None or stage not in plan.steps else plan.why(stage)
+
+
+def _plan_as_last_cut(name: str, data: Path) -> Plan | None:
+    """The steps of a region's tiles, aligned or not as they were last cut; None when they never were."""
+    region, data = region_named(name, data)
+    store = Store(data / "work")
+    last = store.latest(region.name, "tile-index")
+    return None if last is None else plan_tiles(region, store, data, align=last["settings"]["align"])[0]
+
+
 # --- pairs: images and masks of others ------------------------------------------------------------------------------
 
 

@@ -170,6 +170,7 @@ def test_a_second_run_computes_nothing_and_a_lost_shard_is_made_alone(
 ) -> None:
     region = tiled.copied_to(tmp_path / "data")
     assert "start" not in cut(capsys, region).err
+    assert "tile-survey              fresh" in brmgeo(capsys, "status", "small", "--data", region.data).out
     before = {p.name: p.read_bytes() for p in (region.out / "tiles").glob("*.tar")}
     artifacts = sorted((region.data / "work" / "artifacts" / "tiles").iterdir())
     assert len(artifacts) > 3
@@ -186,6 +187,9 @@ def test_other_settings_leave_no_shard_of_the_old_ones(
     tiled: SmallRegion, tmp_path: Path, capsys: Capture
 ) -> None:
     region = tiled.copied_to(tmp_path / "data")
+    region.edit("guard_m = 12", "guard_m = 15")
+    why = brmgeo(capsys, "why", "small", "tile-survey", "--data", region.data).out
+    assert "guard_m: 12.0 -> 15.0" in why
     assert cut(capsys, region, "--gsd", "1.7", "--split", "test").status == 0
     tiles = tiles_of(region)
     assert {info.split for info in tiles.infos} == {"test"}
