@@ -479,6 +479,12 @@ def simulate(
     type=click.Choice(["probability", "mask"]),
     help="What the matcher gets of the network: probabilities, or masks above the threshold.",
 )
+@click.option(
+    "--roof-height",
+    "roof_m",
+    type=click.FloatRange(0, 100),
+    help="Metres above ground at which the roofs stand that the network finds (default 3, one storey).",
+)
 def localize(
     region: str | None,
     data: Path,
@@ -495,6 +501,7 @@ def localize(
     masks: str,
     weights: Path | None,
     answer: str | None,
+    roof_m: float | None,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
     from pipelines import flights as job
@@ -510,7 +517,14 @@ def localize(
             raise SettingsError("localize --maps: give --out, the folder for the results")
         out = data / "out" / own.name / "flights" / job.flight_name(flight) / method
     cache = data / "work" / "masks" if region is not None else out.absolute().parent / ".brmgeo-masks"
-    use = NetworkUse(masks, weights, answer or NetworkUse().answer, cache)  # type: ignore[arg-type]
+    own_use = NetworkUse()
+    use = NetworkUse(
+        masks,  # type: ignore[arg-type]
+        weights,
+        answer or own_use.answer,  # type: ignore[arg-type]
+        cache,
+        own_use.roof_m if roof_m is None else roof_m,
+    )
     job.localize(
         folder,
         flight,

@@ -54,8 +54,10 @@ from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
 from pipelines.maps import NativeImagery, native_imagery
 from pipelines.masks import (
+    ROOF_M,
     FrameMasks,
     NetworkUse,
+    above_roofs_m,
     frame_masks,
     network_mask,
     network_name,
@@ -177,7 +179,7 @@ def view_at(flight: Flight, gsd_m: float, index: int, masks: FrameMasks | None =
         flight.mount,
         frame.roll_rad,
         frame.pitch_rad,
-        frame.agl_m,
+        frame.agl_m if masks is None else masks.agl_m(index),
         gsd_m,
         t_s=frame.t_s,
         file=frame.file,
@@ -856,7 +858,20 @@ def _views_by_masks(
             )
         else:
             images = (simulator.mask(i, relief=True) for i in frames)
-        seen[kind] = [simulator.view(i, image, maps.ground.gsd_m) for i, image in zip(frames, images)]
+        # All of them show roofs where the camera sees them, so all are laid onto the same plane.
+        seen[kind] = [
+            make_view(
+                image,
+                settings.camera,
+                settings.mount,
+                math.radians(course.measured_roll_deg[i]),
+                math.radians(course.measured_pitch_deg[i]),
+                above_roofs_m(float(course.measured_agl_m[i]), ROOF_M),
+                maps.ground.gsd_m,
+                t_s=float(course.frame_times_s[i]),
+            )
+            for i, image in zip(frames, images)
+        ]
     return seen
 
 

@@ -53,6 +53,9 @@ from brmgeo.workflow.progress import Bar, Progress
 Answer = Literal["mask", "probability"]
 #: Probabilities on disk: 0 to 254 for 0 to 1, 255 for unknown.
 STEPS, UNKNOWN = 254, 255
+#: A network finds roofs, and a roof is seen where its height puts it: its masks are laid onto a plane this high above ground
+#: (one storey), not onto the ground. Sheffield's frames then register 0.7 m nearer to the reference.
+ROOF_M = 3.0
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 SIGN = "masks.json"
 _FORMAT = 1  # of the cache's files and key
@@ -71,12 +74,18 @@ class FrameMasks:
         source: for reports: the flight's own masks, or the network and its weights.
         files: the network's probability of each frame; None for the flight's own masks.
         threshold: probabilities above it are building; None hands probabilities on as they are.
+        roof_m: what the masks show as building stands this high above ground; 0 for outlines on the ground.
     """
 
     flight: Flight
     source: str
     files: tuple[Path, ...] | None = None
     threshold: float | None = None
+    roof_m: float = 0.0
+
+    def agl_m(self, index: int) -> float:
+        """Height of a frame above what its mask shows, metres."""
+        return above_roofs_m(self.flight.frames[index].agl_m, self.roof_m)
 
     def image(self, index: int) -> NDArray[Any]:
         """(height, width) of one frame: uint8 0 or 255, or float32 probability with NaN where unknown."""
@@ -98,12 +107,14 @@ class NetworkUse:
         weights: their file; None for those that ship with brmgeo. A file means the network in any case.
         answer: hand the matcher masks or probabilities.
         cache: folder in which answers are kept; None keeps none beyond the run.
+        roof_m: height above ground of the roofs it finds.
     """
 
     wanted: Literal["given", "network"] = "given"
     weights: Path | None = None
     answer: Answer = "probability"
     cache: Path | None = None
+    roof_m: float = ROOF_M
 
     def asks_network(self, flight: Flight) -> bool:
         """True where the network is to make the masks of a flight."""
@@ -132,7 +143,13 @@ def frame_masks(flight: Flight, given: str, use: NetworkUse, progress: Progress)
         threshold = segmenter.card.threshold if use.answer == "mask" else None
         runs = {"onnx": "ONNX Runtime", "torch": "torch"}[segmenter.backend]
         shown = "probabilities" if threshold is None else f"masks above {threshold:g}"
-        yield FrameMasks(flight, f"network {segmenter.name} ({runs}), {shown}", files, threshold)
+        source = f"network {segmenter.name} ({runs}), {shown}, roofs at {use.roof_m:g} m"
+        yield FrameMasks(flight, source, files, threshold, use.roof_m)
+
+
+def above_roofs_m(agl_m: float, roof_m: float) -> float:
+    """Height above roofs of a camera ``agl_m`` above ground; at least half of that."""
+    return max(agl_m - roof_m, agl_m / 2.0)
 
 
 @functools.lru_cache(maxsize=2)

@@ -125,7 +125,7 @@ class ModelCard:
         lines = [
             f"# {name}",
             "",
-            f"A {self.architecture} that finds buildings in pictures from above, for brmgeo.",
+            f"The {self.architecture} that finds buildings in pictures from above, for brmgeo.",
             "",
             "| | |",
             "|---|---|",

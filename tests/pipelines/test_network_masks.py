@@ -20,12 +20,16 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import shapely
 from affine import Affine
 from rasterio.enums import ColorInterp
 
+from brmgeo.flight.readings import Attitude
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
 from brmgeo.segment.predict import SHIPPED, Segmenter
+from brmgeo.synth.flight import FlightSettings as Simulated
+from brmgeo.synth.flight import Ground, Simulator, fly
 from pipelines import flights
 from pipelines import masks as job
 
@@ -170,6 +174,41 @@ def test_given_masks_are_used_unless_the_network_is_wanted(
     words = ("localize", "--maps", maps, "--flight", folder, "--out", tmp_path / "out")
     assert "has no frames" in say(*words, "--weights", weights).line
     assert "has no frames" in say(*words, "--masks", "network").line
+
+
+def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
+    """Boxes 6 m high seen from 100 m aslant: laid onto a plane at 6 m their roofs are the map's outlines."""
+    rng = np.random.default_rng(3)
+    at = [(x, y) for x in range(0, 200, 25) for y in range(0, 200, 25)]
+    boxes = [
+        shapely.box(x, y, x + w, y + h)
+        for (x, y), (w, h) in zip(at, rng.uniform(6, 16, (64, 2)), strict=True)
+    ]
+    ground = Ground.from_polygons(boxes, [6.0] * len(boxes))
+    own = Simulated(mount=Attitude(pitch_rad=math.radians(-15)), agl_m=100.0, agl_sigma_m=0.0).exact()
+    path = np.array([[60.0, 100.0], [120.0, 100.0]])
+    simulator = Simulator(ground, own, fly(path, own, 1), 1)
+    pose = simulator.course
+
+    def overlap(relief: bool, roof_m: float) -> float:
+        view = flights.make_view(
+            simulator.mask(1, relief), own.camera, own.mount, math.radians(pose.measured_roll_deg[1]),
+            math.radians(pose.measured_pitch_deg[1]), job.above_roofs_m(100.0, roof_m), 0.25,
+        )  # fmt: skip
+        rows, cols = np.indices(view.building.shape) + 0.5
+        ahead, left = (view.nadir_px[0] - rows) * 0.25, (view.nadir_px[1] - cols) * 0.25
+        x, y, _ = pose.xyz_m[pose.frame_index[1]]
+        yaw = pose.roll_pitch_yaw[pose.frame_index[1], 2]
+        c, s = math.cos(yaw), math.sin(yaw)
+        there = shapely.union_all(boxes)
+        built = shapely.contains_xy(there, x + ahead * c - left * s, y + ahead * s + left * c) & view.known
+        seen = (view.building > 0.5) & view.known
+        return float((built & seen).sum() / (built | seen).sum())
+
+    assert overlap(False, 0.0) > 0.97
+    assert overlap(True, 6.0) > 0.95
+    assert overlap(True, 0.0) < 0.85
+    assert job.above_roofs_m(4.0, 3.0) == 2.0
 
 
 @pytest.mark.parametrize(
