@@ -251,6 +251,11 @@ def tiles(
 )
 @click.option("--steps", type=click.IntRange(min=1), help="Train this many steps, in place of the recipe's.")
 @click.option("--threads", type=click.IntRange(min=1), help="Processor threads (default: all).")
+@click.option(
+    "--start",
+    type=FILE,
+    help="Weights (.safetensors) to go on from, such as the shipped ones, on ground of your own.",
+)
 def train(
     region: str | None,
     data: Path,
@@ -259,6 +264,7 @@ def train(
     out: Path | None,
     steps: int | None,
     threads: int | None,
+    start: Path | None,
 ) -> None:
     """Train the U-Net by a recipe, and test it on REGION, which it never trains on. A killed run is taken up again."""
     from pipelines import network as job
@@ -280,6 +286,7 @@ def train(
         test_regions=(region,) if region else (),
         steps=steps,
         threads=threads,
+        start=start,
         say=click.echo,
     )
 

@@ -92,7 +92,10 @@ class SourceSpec(_Spec):
 
 
 class Recipe(_Spec):
-    """A training run as a file: what is trained, on what, how. ``work_gsd_m``: what pictures of other GSDs are resampled to."""
+    """A training run as a file: what is trained, on what, and how.
+
+    Pictures of a GSD that was not trained for are resampled to ``work_gsd_m``.
+    """
 
     title: str
     work_gsd_m: Annotated[float, Field(gt=0, le=2)]
@@ -284,12 +287,6 @@ def gather(
     Raises MissingInputError and InputError as the readers do, SettingsError for a path that no source asks for
     and for regions that must not be trained on.
     """
-    names = {s.name for s in recipe.source if s.kind in ("pairs", "xyz", "flight")}
-    for name in paths:
-        if name not in names:
-            raise SettingsError(
-                f"--source {name}=...: the recipe asks for {', '.join(sorted(names)) or 'no folder'}; name one of these"
-            )
     train: list[tuple[Source, float]] = []
     crops: list[tuple[str, Source]] = []
     frames: dict[str, dict[str, list[Picture]]] = {"validation": {}, "test": {}}
@@ -310,16 +307,7 @@ def gather(
                 digest.update(scene.name.encode() + str(scene.gsd_m).encode())
                 digest.update(hashlib.sha256(scene.image.tobytes() + scene.label.tobytes()).digest())
 
-    extra = [SourceSpec(name=r, kind="tiles", split="test", regions=(r,)) for r in test_regions]
-    named = {r for s in recipe.source for r in s.regions}
-    for spec in (*recipe.source, *(s for s in extra if s.name not in named)):
-        if spec.name in names and spec.name not in paths:
-            if spec.split == "test":
-                say(f"{spec.name}: not tested on, since no --source {spec.name}=PATH is given")
-                continue
-            raise MissingInputError(
-                f"recipe {recipe.title!r} trains on {spec.name}: give its folder, --source {spec.name}=PATH"
-            )
+    for spec in _checked(recipe, data, paths, test_regions, say):
         if spec.kind == "generated":
             cache = data / "work" / "scenes"
             gsd = spec.gsd_m or recipe.work_gsd_m
@@ -333,10 +321,7 @@ def gather(
             use(spec.name, spec.split, parts[0], spec.weight)
             use(spec.name, "validation", parts[1], spec.weight)
         elif spec.kind == "pairs":
-            if spec.gsd_m is None or spec.split != "train":
-                raise SettingsError(
-                    f"recipe source {spec.name}: pairs are for training, and need their gsd_m"
-                )
+            assert spec.gsd_m is not None
             _, images, labels = read_pairs(paths[spec.name])
             # What is mostly blank teaches little, and a mosaic has room for others.
             seen = [k for k, la in enumerate(labels) if (la != UNKNOWN).mean() > 0.8]
@@ -346,8 +331,6 @@ def gather(
             for image, label in small:
                 digest.update(hashlib.sha256(image.tobytes() + label.tobytes()).digest())
         elif spec.kind == "flight":
-            if spec.split != "test":
-                raise SettingsError(f'recipe source {spec.name}: a flight is for tests only: split = "test"')
             frames["test"][spec.name] = _flight_frames(paths[spec.name])
         else:
             for part, weight, source, pictures, seen_digest in _tile_sources(spec, data, recipe.work_gsd_m):
@@ -370,6 +353,50 @@ def gather(
         raise SettingsError(f"recipe {recipe.title!r}: names no ground to train on, or none to validate on")
     mixture = Mixture([s for s, _ in train], [w for _, w in train])
     return Ground(mixture, crops, frames["validation"], frames["test"], credits, digest.hexdigest())
+
+
+def _checked(
+    recipe: Recipe,
+    data: Path,
+    paths: Mapping[str, Path],
+    test_regions: Sequence[str],
+    say: Callable[[str], None],
+) -> list[SourceSpec]:
+    """The sources to be read, all looked at before the first is painted or read; see ``gather`` for what is raised."""
+    from pipelines import training
+
+    names = {s.name for s in recipe.source if s.kind in ("pairs", "xyz", "flight")}
+    for name in paths:
+        if name not in names:
+            raise SettingsError(
+                f"--source {name}=...: the recipe asks for {', '.join(sorted(names)) or 'no folder'}; name one of these"
+            )
+    for region in test_regions:
+        if any(region in s.regions and s.split != "test" for s in recipe.source):
+            raise SettingsError(
+                f"region {region} is trained on by recipe {recipe.title!r}: name another to test on"
+            )
+    named = {r for s in recipe.source for r in s.regions}
+    own = [
+        SourceSpec(name=r, kind="tiles", split="test", regions=(r,)) for r in test_regions if r not in named
+    ]
+    used = []
+    for spec in (*recipe.source, *own):
+        if spec.kind == "flight" and spec.split != "test":
+            raise SettingsError(f'recipe source {spec.name}: a flight is for tests only: split = "test"')
+        if spec.kind == "pairs" and (spec.gsd_m is None or spec.split != "train"):
+            raise SettingsError(f"recipe source {spec.name}: pairs are for training, and need their gsd_m")
+        if spec.kind == "tiles":
+            training.require_all_trainable(spec.regions, data, "test" if spec.split == "test" else None)
+        if spec.name not in names or spec.name in paths:
+            used.append(spec)
+        elif spec.split == "test":
+            say(f"{spec.name}: not tested on, since no --source {spec.name}=PATH is given")
+        else:
+            raise MissingInputError(
+                f"recipe {recipe.title!r} trains on {spec.name}: give its folder, --source {spec.name}=PATH"
+            )
+    return used
 
 
 def _reduced(scene: Scene, finest_m: float) -> Scene:
@@ -415,7 +442,6 @@ def _tile_sources(
     """(split, weight, source, frames, digest) of each region's tiles; the tiles are cut first where they are not there."""
     from pipelines import training
 
-    training.require_all_trainable(spec.regions, data, "test" if spec.split == "test" else None)
     for region in spec.regions:
         folder = data / "out" / region / "tiles"
         if not (folder / "tiles.json").is_file():
@@ -465,15 +491,18 @@ def train(
     test_regions: Sequence[str] = (),
     steps: int | None = None,
     threads: int | None = None,
+    start: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Trains by a recipe, or takes up where a run in ``out`` ended, then calibrates, tests and writes the results.
 
     ``out`` receives weights.safetensors and .md (the card), model.onnx, metrics.json, curves.csv and .png, reliability.png,
-    pictures/epoch-NNN.png and checkpoint.safetensors; returns what is in metrics.json. Raises SettingsError, InputError.
+    pictures/epoch-NNN.png and checkpoint.safetensors; returns what is in metrics.json. ``start``: weights
+    (.safetensors) to go on from in place of random ones. Raises SettingsError, InputError.
     """
     from brmgeo.segment import train as engine
     from brmgeo.segment.unet import UNetSettings
+    from brmgeo.segment.weights import load_weights
 
     started = time.monotonic()
     recipe = read_recipe(recipe_path)
@@ -487,8 +516,12 @@ def train(
     crops = engine.validation_crops(
         [s for _, s in ground.crops], recipe.validation_crops, settings.crop_px, recipe.work_gsd_m
     )
+    initial = None
+    if start is not None:
+        initial, before = load_weights(start)
+        ground.credits.append({"name": f"weights {before.digest}", "kind": "start", "data": before.data})
     out.mkdir(parents=True, exist_ok=True)
-    trainer = engine.Trainer(unet, settings, augment, ground.train, crops, out, ground.digest)
+    trainer = engine.Trainer(unet, settings, augment, ground.train, crops, out, ground.digest, initial)
     say(
         f"{recipe.title}: {settings.steps} steps of {settings.batch * settings.accumulate} crops on {trainer.device.type}"
     )

@@ -253,52 +253,96 @@ def _roofs(img: F32, label: U8, rng: np.random.Generator) -> F32:
     return np.asarray(painted * soft + img * (1 - soft), np.float32)
 
 
-_FLAT = np.array(  # tennis blue and green, clay, pool, asphalt, concrete, turf
+_COURTS = np.array(  # hard courts, clay, turf, rubber
     [
         (58, 104, 168),
         (70, 120, 88),
         (168, 96, 72),
-        (120, 204, 214),
-        (92, 92, 94),
-        (188, 184, 174),
         (92, 140, 70),
+        (110, 112, 116),
+        (88, 92, 128),
+        (150, 150, 146),
     ],
     np.float32,
 )
 
 
 def _objects(img: F32, label: U8, gsd_m: float, rng: np.random.Generator) -> F32:
-    """Flat things that are no building, where the ground is open: courts with their lines, pools, paved squares, turf."""
-    h, w = label.shape
+    """Flat things that are no building, where the ground is open: courts with their lines, pools, car parks, slabs."""
     img = img.copy()
-    free = cv2.distanceTransform((label == 0).astype(np.uint8), cv2.DIST_L2, 3)
-    for _ in range(int(rng.integers(1, 5))):
-        kind = int(rng.integers(len(_FLAT)))
-        long = float(rng.uniform(6, 12) if kind == 3 else rng.uniform(10, 38)) / gsd_m
-        wide = long * float(rng.uniform(0.4, 0.8))
-        row, col = int(rng.integers(h)), int(rng.integers(w))
-        fits = free[row, col] > math.hypot(long, wide) / 2
+    ground = (label == 0).astype(np.uint8)
+    for _ in range(int(rng.integers(1, 4))):
+        free = cv2.distanceTransform(ground, cv2.DIST_L2, 3)
+        reach = min(float(free.max()) * 0.98, 26.0 / gsd_m)
+        if reach * gsd_m < 3.0:
+            break
+        reach *= float(rng.uniform(0.4, 1.0))
+        fits = np.flatnonzero(free > reach)
+        row, col = divmod(int(fits[rng.integers(fits.size)]), label.shape[1])
+        corner = float(rng.uniform(0.45, 0.8))  # half the angle between the diagonals
+        size = (2 * reach * math.cos(corner), 2 * reach * math.sin(corner))
         angle = float(rng.uniform(0, 180))
-        colour = _FLAT[kind] * np.float32(rng.uniform(0.8, 1.15)) + rng.normal(0, 8, 3).astype(np.float32)
-        lines = bool(kind < 3 or rng.random() < 0.4)
-        if not fits:
-            continue
-        rgb = tuple(float(c) for c in colour)
-        shade = cv2.GaussianBlur(rng.standard_normal((h, w)).astype(np.float32), (0, 0), 3.0)
         layer = img.copy()
-
-        def box(scale_u: float, scale_v: float, at: tuple[int, int] = (col, row)) -> NDArray[np.int32]:
-            return np.rint(cv2.boxPoints((at, (long * scale_u, wide * scale_v), angle))).astype(np.int32)  # noqa: B023
-
-        border = np.clip(colour * np.float32(rng.uniform(0.7, 1.4)), 0, 255)
-        cv2.fillPoly(layer, [box(1.0, 1.0)], tuple(float(c) for c in border), cv2.LINE_AA)
-        cv2.fillPoly(layer, [box(0.85, 0.8)], rgb, cv2.LINE_AA)
-        if lines:
-            white = (225.0, 225.0, 222.0)
-            for u, v in ((0.75, 0.65), (0.75, 0.45), (0.4, 0.65), (0.001, 0.65)):
-                cv2.polylines(layer, [box(u, v)], True, white, 1, cv2.LINE_AA)
-        img = layer + (8.0 * shade * (np.abs(layer - img).max(2) > 0))[..., None]
+        _draw_object(layer, (col, row), size, angle, gsd_m, rng)
+        drawn = (np.abs(layer - img).max(2) > 0).astype(np.float32)[..., None]
+        grain = cv2.GaussianBlur(rng.standard_normal(label.shape, np.float32), (0, 0), 2.0)[..., None]
+        img = layer + np.float32(rng.uniform(2, 30)) * grain * drawn
+        ground[drawn[..., 0] > 0] = 0
     return np.asarray(img, np.float32)
+
+
+def _draw_object(
+    layer: F32,
+    at: tuple[int, int],
+    size: tuple[float, float],
+    angle: float,
+    gsd_m: float,
+    rng: np.random.Generator,
+) -> None:
+    """One court, pool, car park or slab of ``size`` (long, wide) pixels about ``at`` (column, row), drawn into ``layer``."""
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+
+    def box(u: float, v: float, long: float, wide: float) -> NDArray[np.int32]:
+        """Corners, in sixteenths of a pixel, of a rectangle at (u, v) of the object's own axes, all in shares of it."""
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (long / 2, wide / 2) + (u, v)
+        corners = corners * size
+        xy = np.column_stack([corners[:, 0] * c - corners[:, 1] * s, corners[:, 0] * s + corners[:, 1] * c])
+        return np.rint((xy + at) * 16).astype(np.int32)
+
+    def fill(corners: NDArray[np.int32], colour: NDArray[np.floating]) -> None:
+        rgb = tuple(float(v) for v in np.clip(colour, 0, 255))
+        cv2.fillPoly(layer, [corners], rgb, cv2.LINE_AA, 4)
+
+    def line(corners: NDArray[np.int32]) -> None:
+        white = (float(rng.uniform(190, 240)),) * 3
+        cv2.polylines(layer, [corners], True, white, 1, cv2.LINE_AA, 4)
+
+    jitter = rng.uniform(0.75, 1.2) * np.ones(3) + rng.normal(0, 0.06, 3)
+    draw = rng.random()
+    if draw < 0.5:
+        outer, inner = _COURTS[rng.integers(len(_COURTS), size=2)] * jitter
+        fill(box(0, 0, 1, 1), outer)
+        courts = int(rng.integers(1, 4))
+        for k in range(courts):
+            v, wide = (k + 0.5) / courts - 0.5, 0.8 / courts
+            fill(box(0, v, 0.8, wide), inner)
+            for long, high in ((0.72, 0.85), (0.72, 0.62), (0.38, 0.62), (0.004, 0.85)):
+                line(box(0, v, long, wide * high))
+    elif draw < 0.65:
+        fill(box(0, 0, 1, 1), np.array([196, 188, 176]) * jitter)
+        fill(box(0, 0, 0.7, 0.6), np.array([110, 200, 212]) * jitter)
+    elif draw < 0.85:
+        fill(box(0, 0, 1, 1), np.array([104, 104, 106]) * jitter)
+        bays = max(2, int(size[0] * gsd_m / 2.7))
+        deep = min(0.45, 5.0 / max(size[1] * gsd_m, 1.0))
+        for k in range(bays):
+            u = (k + 0.5) / bays - 0.5
+            for v in (-0.5 + deep / 2, 0.5 - deep / 2):
+                line(box(u, v, 1 / bays, deep))
+                if rng.random() < 0.45:
+                    fill(box(u, v, 0.65 / bays, 0.85 * deep), rng.uniform(20, 240) + rng.normal(0, 15, 3))
+    else:
+        fill(box(0, 0, 1, 1), np.full(3, rng.uniform(110, 220)) * jitter)
 
 
 def _colour(img: F32, strength: float, rng: np.random.Generator) -> F32:

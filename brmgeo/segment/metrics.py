@@ -196,7 +196,7 @@ class LogitHistogram:
     @property
     def logits(self) -> NDArray[np.float64]:
         """(BINS,) float64, the middle of each bin."""
-        return (np.arange(self.BINS) + 0.5) * 0.05 - self.LIMIT
+        return np.asarray((np.arange(self.BINS) + 0.5) * 0.05 - self.LIMIT, np.float64)
 
     def entropy(self, temperature: float) -> float:
         """Mean cross-entropy, nats a pixel, of sigmoid(logit / temperature)."""

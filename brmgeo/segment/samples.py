@@ -165,7 +165,7 @@ class Mixture:
         return source.patch(rng, reach_m, near_buildings)
 
 
-def blank_unknown(image: U8, label: U8, least_px: int = 12) -> U8:
+def blank_unknown(image: U8, label: U8, least_px: int = 13) -> U8:
     """The label with 127 where the picture is plain white or black over ``least_px`` or more: nothing was seen there."""
     out = label.copy()
     for value in (0, 255):

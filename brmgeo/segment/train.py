@@ -47,7 +47,8 @@ class TrainSettings:
 
     Attributes:
         seed: of the weights and of every crop.
-        steps: of the optimiser, at most.
+        steps: of the optimiser, at most; the schedule of the learning rate is laid out for them.
+        stop_after: steps after which to stop before that; 0: never. For a run that another one goes on from.
         batch: crops a forward pass; accumulate: passes a step (their gradients are averaged).
         crop_px: side of a crop, a multiple of the U-Net's ``multiple_px``.
         lr, warmup_steps: the highest learning rate, and the steps to reach it; then a cosine down to a hundredth.
@@ -66,6 +67,7 @@ class TrainSettings:
 
     seed: int = 1
     steps: int = 2000
+    stop_after: int = 0
     batch: int = 6
     accumulate: int = 1
     crop_px: int = 192
@@ -177,8 +179,9 @@ class Trainer:
         validation: (images (n, s, s, 3) uint8, labels (n, s, s) uint8), the same for every epoch; held-out ground.
         folder: where ``checkpoint.safetensors`` lies.
         data: names the sources and their contents; a checkpoint of other data is not resumed.
+        initial: weights to go on from (``UNet.state_dict`` as arrays), in place of random ones.
 
-    Raises SettingsError for a crop size that the U-Net does not take.
+    Raises SettingsError for a crop size that the U-Net does not take, InputError for initial weights that do not fit it.
     """
 
     def __init__(
@@ -190,6 +193,7 @@ class Trainer:
         validation: tuple[U8, U8],
         folder: Path,
         data: str = "",
+        initial: Mapping[str, NDArray[Any]] | None = None,
     ) -> None:
         if settings.crop_px % unet.multiple_px:
             raise SettingsError(
@@ -208,6 +212,12 @@ class Trainer:
             "augment": asdict(augment),
             "data": data,
         }
+        self._initial = {name: torch.from_numpy(np.array(v)) for name, v in (initial or {}).items()}
+        if initial:
+            whole = hashlib.sha256()
+            for name in sorted(initial):
+                whole.update(name.encode() + np.ascontiguousarray(initial[name]).tobytes())
+            what["initial"] = whole.hexdigest()
         self._digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         gpu = settings.device != "cpu" and torch.cuda.is_available()
         if settings.device == "cuda" and not gpu:
@@ -224,10 +234,19 @@ class Trainer:
         with torch.random.fork_rng():
             torch.manual_seed(self._settings.seed)
             model = UNet(self._unet)
+        if self._initial:
+            try:
+                model.load_state_dict(self._initial)
+            except RuntimeError:
+                raise InputError(
+                    f"the weights to go on from are not of a U-Net of the widths {list(self._unet.widths)} with "
+                    f"{self._unet.norm} norm: give the recipe their settings"
+                ) from None
         average = UNet(self._unet)
         average.load_state_dict(model.state_dict())
         for net in (model, average):
-            net.to(self.device, memory_format=torch.channels_last)
+            # torch's stubs know this form of `to` of tensors only.
+            net.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         decayed = [p for p in model.parameters() if p.ndim > 1]
         others = [p for p in model.parameters() if p.ndim <= 1]
         optimiser = torch.optim.AdamW(
@@ -255,11 +274,12 @@ class Trainer:
         """
         s = self._settings
         run = self.start()
-        while run.step < s.steps and not self._exhausted(run):
+        last = min(s.steps, s.stop_after or s.steps)
+        while run.step < last and not self._exhausted(run):
             loss = self.advance(run)
             if on_step:
                 on_step(run.step, loss)
-            if run.step % s.epoch_steps == 0 or run.step == s.steps:
+            if run.step % s.epoch_steps == 0 or run.step == last:
                 probability = self._close_epoch(run)
                 if on_epoch:
                     on_epoch(run, probability)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 from pathlib import Path
@@ -137,9 +138,22 @@ def test_a_tiny_network_learns_bright_squares(tmp_path: Path, crops: Any) -> Non
     assert run.history[-1].validation_iou > 0.85
     assert seen[-1].shape == crops[1].shape
     assert run.history[-1].loss < run.history[0].loss
-    np.testing.assert_allclose(
-        seen[-1], 1 / (1 + np.exp(-engine.predict(run.average, crops[0]))), atol=1e-5
-    )
+    np.testing.assert_allclose(seen[-1], 1 / (1 + np.exp(-engine.predict(run.average, crops[0]))), atol=1e-5)
+
+
+def test_a_run_goes_on_from_given_weights_or_refuses_them(tmp_path: Path, crops: Any) -> None:
+    first = trainer(tmp_path / "first", crops).train()
+    weights = engine.tensors_of(first.best)
+    source, mild = Scenes([town(1)]), AugmentSettings()
+    second = Trainer(TINY, SETTINGS, mild, source, crops, tmp_path / "second", "", weights)
+    for name, tensor in second.start().model.state_dict().items():
+        np.testing.assert_array_equal(tensor.numpy(), weights[name])
+    second.save(second.start())
+    with pytest.raises(InputError, match="other settings or data"):
+        Trainer(TINY, SETTINGS, mild, source, crops, tmp_path / "second", "").start()
+    other = UNetSettings(widths=(8, 16, 32))
+    with pytest.raises(InputError, match="not of a U-Net"):
+        Trainer(other, SETTINGS, mild, source, crops, tmp_path / "third", "", weights).start()
 
 
 def test_patience_stops_a_run_that_gets_no_better(tmp_path: Path, crops: Any) -> None:
@@ -182,7 +196,7 @@ def test_the_rate_rises_then_falls_to_a_hundredth() -> None:
     rates = [rate_at(k, s) for k in range(100)]
     assert rates[0] == pytest.approx(0.05)
     assert max(rates) == rates[10] == pytest.approx(0.5)
-    assert all(a > b for a, b in zip(rates[10:], rates[11:]))
+    assert all(a > b for a, b in itertools.pairwise(rates[10:]))
     assert rate_at(55, s) == pytest.approx(0.5 * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi / 2))))
     assert rates[-1] == pytest.approx(0.005, rel=0.1)
 

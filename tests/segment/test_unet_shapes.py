@@ -64,7 +64,8 @@ def test_pictures_of_any_size_are_predicted_and_left_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"widths": (16,)}, {"widths": (16, 20)}, {"widths": (0, 8)}, {"norm": "layer"}, {"in_channels": 0}]
+    "bad",
+    [{"widths": (16,)}, {"widths": (16, 20)}, {"widths": (0, 8)}, {"norm": "layer"}, {"in_channels": 0}],
 )
 def test_settings_that_are_no_unet_are_refused(bad: dict[str, object]) -> None:
     with pytest.raises(SettingsError, match="U-Net"):

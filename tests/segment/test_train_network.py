@@ -1,0 +1,203 @@
+"""`brmgeo train`: recipes, the ground they name, what is refused, and a whole small run with its files."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.region import load_region
+from pipelines import network
+from pipelines.cli import cli
+
+ROOT = Path(__file__).resolve().parents[2]
+RECIPES = ROOT / "data" / "recipes"
+
+TINY = """
+title = "tiny"
+work_gsd_m = 0.6
+validation_crops = 4
+[unet]
+widths = [8, 16]
+[training]
+steps = 4
+batch = 2
+crop_px = 32
+warmup_steps = 1
+epoch_steps = 2
+device = "cpu"
+[augment]
+gsd_m = [0.5, 0.8]
+[[source]]
+name = "towns"
+kind = "generated"
+seeds = [901]
+size_m = 300
+[[source]]
+name = "held"
+kind = "generated"
+split = "validation"
+seeds = [902]
+size_m = 300
+[[source]]
+name = "far"
+kind = "generated"
+split = "test"
+seeds = [903]
+size_m = 300
+[[source]]
+name = "flown"
+kind = "flight"
+split = "test"
+"""
+
+
+def write_tiles(folder: Path, keys: list[tuple[int, int]], zoom: int) -> None:
+    for part in ("images", "masks"):
+        (folder / part).mkdir(parents=True)
+    for x, y in keys:
+        name = f"OAM-{x}-{y}-{zoom}.png"
+        cv2.imwrite(str(folder / "images" / name), np.full((16, 16, 3), (x % 10) * 10 + y % 10, np.uint8))
+        cv2.imwrite(str(folder / "masks" / name), np.full((16, 16), 255 * (x % 2), np.uint8))
+
+
+def test_web_tiles_lie_as_on_the_ground_and_validation_is_apart(tmp_path: Path) -> None:
+    x0, y0, zoom = 1238424, 1046544, 21
+    keys = [(x0 + x, y0 + y) for x in range(6) for y in range(2)] + [(x0 + 20, y0)]
+    write_tiles(tmp_path, keys, zoom)
+    train, validation = network.xyz_scenes(tmp_path, zoom, 0.34)
+    latitude = math.atan(math.sinh(math.pi * (1 - 2 * (y0 + 1) / 2**zoom)))
+    assert train[0].gsd_m == pytest.approx(156543.03392 * 16 * math.cos(latitude) / 2**zoom, rel=1e-4)
+    # Two columns of six for validation, the next for nobody, three for training; the tile far away is a scene of its own.
+    assert [s.label.shape for s in validation] == [(32, 32)]
+    assert [s.label.shape for s in train] == [(32, 48), (16, 16)]
+    assert train[0].image[20, 0].tolist() == [((x0 + 3) % 10) * 10 + (y0 + 1) % 10] * 3
+    assert {*np.unique(train[0].label[:, :16])} == {255 * ((x0 + 3) % 2)}
+
+
+def test_tiles_without_neighbours_leave_unknown_ground_between(tmp_path: Path) -> None:
+    write_tiles(tmp_path, [(10, 10), (11, 10), (11, 11)], 12)
+    (scene,) = network.xyz_scenes(tmp_path, 12, 0.0)[0]
+    assert (scene.label[16:, :16] == 127).all()
+
+
+def test_pairs_that_are_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MissingInputError, match="images"):
+        network.read_pairs(tmp_path)
+    write_tiles(tmp_path, [(1, 1), (2, 1)], 12)
+    with pytest.raises(InputError, match="zoom level 13"):
+        network.xyz_scenes(tmp_path, 13, 0.0)
+    (tmp_path / "masks" / "OAM-2-1-12.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="cannot be read"):
+        network.read_pairs(tmp_path)
+    (tmp_path / "masks" / "OAM-2-1-12.png").unlink()
+    with pytest.raises(MissingInputError, match="every image needs its mask"):
+        network.read_pairs(tmp_path)
+
+
+def test_a_generated_scene_is_painted_once_and_labels_its_roofs(tmp_path: Path) -> None:
+    scene = network.generated_scene(901, 300.0, 0.6, 0, tmp_path)
+    (file,) = tmp_path.iterdir()
+    before = file.stat().st_mtime_ns
+    again = network.generated_scene(901, 300.0, 0.6, 0, tmp_path)
+    assert file.stat().st_mtime_ns == before
+    np.testing.assert_array_equal(scene.image, again.image)
+    assert 0.01 < (scene.label == 255).mean() < 0.5
+    assert {*np.unique(scene.label)} == {0, 255}
+    winter = network.generated_scene(901, 300.0, 0.6, 1, tmp_path)
+    np.testing.assert_array_equal(scene.label, winter.label)
+    assert (scene.image != winter.image).mean() > 0.5
+
+
+def test_the_projects_recipes_hold_and_never_train_on_what_is_for_testing() -> None:
+    held = {
+        region.generate.seed
+        for path in (ROOT / "data" / "regions").glob("[a-z]*.toml")
+        if (region := load_region(path)).generate and region.training.hold_out
+    }
+    assert 1 in held
+    for path in RECIPES.glob("*.toml"):
+        recipe = network.read_recipe(path)
+        for source in recipe.source:
+            if source.split != "test":
+                assert not held & set(source.seeds), path
+                assert source.kind != "flight"
+                assert "sheffield" not in source.name
+
+
+def test_recipes_that_are_wrong_are_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.toml"
+    with pytest.raises(MissingInputError, match="no such recipe"):
+        network.read_recipe(path)
+    path.write_text(TINY.replace("seeds = [901]", "seed = 901"))
+    with pytest.raises(SettingsError, match="seed"):
+        network.read_recipe(path)
+    path.write_text("title = ")
+    with pytest.raises(SettingsError, match="not valid TOML"):
+        network.read_recipe(path)
+    path.write_text(TINY.replace("steps = 4", "stepz = 4"))
+    with pytest.raises(SettingsError, match="no setting 'stepz'"):
+        network.train(path, tmp_path, tmp_path / "out")
+
+
+def gather(recipe: str, tmp_path: Path, **paths: Path) -> Any:
+    file = tmp_path / "recipe.toml"
+    file.write_text(recipe)
+    return network.gather(network.read_recipe(file), tmp_path, paths, (), 0.5, lambda text: None)
+
+
+def test_sources_that_are_wrong_are_refused(tmp_path: Path) -> None:
+    pairs = TINY + '[[source]]\nname = "abroad"\nkind = "pairs"\ngsd_m = 0.1\n'
+    with pytest.raises(MissingInputError, match="--source abroad=PATH"):
+        gather(pairs, tmp_path)
+    with pytest.raises(SettingsError, match="name one of these"):
+        gather(TINY, tmp_path, nowhere=tmp_path)
+    with pytest.raises(SettingsError, match="tests only"):
+        gather(TINY.replace('kind = "flight"\nsplit = "test"', 'kind = "flight"'), tmp_path, flown=tmp_path)
+
+
+def test_a_region_that_is_held_out_is_never_trained_on(tmp_path: Path) -> None:
+    (tmp_path / "regions").mkdir()
+    (tmp_path / "regions" / "demo.toml").write_text((ROOT / "data" / "regions" / "demo.toml").read_text())
+    own = TINY + '[[source]]\nname = "own"\nkind = "tiles"\nregions = ["demo"]\n'
+    with pytest.raises(SettingsError, match="held out"):
+        gather(own, tmp_path)
+
+
+def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path) -> None:
+    recipe = tmp_path / "tiny.toml"
+    recipe.write_text(TINY)
+    out = tmp_path / "out"
+    said: list[str] = []
+    facts = network.train(recipe, tmp_path, out, say=said.append)
+    assert any("flown: not tested on" in line for line in said)
+    made = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert made == {
+        "checkpoint.safetensors", "curves.csv", "curves.png", "metrics.json", "model.onnx", "reliability.png",
+        "weights.md", "weights.safetensors", "pictures/epoch-001.png", "pictures/epoch-002.png",
+    }  # fmt: skip
+    assert json.loads((out / "metrics.json").read_text()) == facts
+    assert set(facts["scores"]) == {"validation: held", "test: far"}
+    assert 0 <= facts["scores"]["test: far"]["iou"] <= 1
+    assert len((out / "curves.csv").read_text().splitlines()) == 3
+    weights = (out / "weights.safetensors").read_bytes()
+    said.clear()
+    network.train(recipe, tmp_path, out, say=said.append)
+    assert not any(line.startswith("epoch") for line in said)
+    assert (out / "weights.safetensors").read_bytes() == weights
+
+
+def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: dict[str, Any] = {}
+    monkeypatch.setattr(network, "train", lambda *args, **kw: seen.update(args=args, **kw))
+    cli(["train", "demo", "--data", str(tmp_path), "--source", "a=b", "--steps", "5"], standalone_mode=False)
+    assert seen["args"] == (tmp_path / "recipes" / "short.toml", tmp_path, tmp_path / "out" / "demo" / "unet")
+    assert (seen["paths"], seen["test_regions"], seen["steps"]) == ({"a": Path("b")}, ("demo",), 5)
+    with pytest.raises(SettingsError, match="NAME=PATH"):
+        cli(["train", "--source", "a"], standalone_mode=False)
