@@ -71,11 +71,12 @@ CONDITIONS = [
     Condition("blur", "shutter 1/30 s", flight={"exposure_s": 1.0 / 30.0}),
     Condition("fast", "15 m/s", flight={"speed_m_s": 15.0, "turn_radius_m": 40.0}),
     Condition("delay 50 ms", "camera late against the IMU", delay_s=0.05),
-    Condition("delay not estimated", "the same, held at zero", delay_s=0.05, vio={"delay_sigma_s": 0.0}),
+    Condition("delay 400 ms", "clocks 0.4 s apart", delay_s=0.4),
+    Condition("delay not estimated", "50 ms, held at zero", delay_s=0.05, vio={"delay_sigma_s": 0.0}),
     Condition("boresight 1 deg", "in roll and pitch", boresight_deg=(1.0, 1.0, 0.0)),
     Condition("boresight yaw 2 deg", "camera turned in its mount", boresight_deg=(0.0, 0.0, 2.0)),
     Condition(
-        "boresight not estimated", "the same, held at zero", boresight_deg=(1.0, 1.0, 0.0), vio={"boresight_sigma_rad": 0.0}
+        "boresight not estimated", "1 deg, held at zero", boresight_deg=(1.0, 1.0, 0.0), vio={"boresight_sigma_rad": 0.0}
     ),
     Condition("AGL +5 m", "altimeter reads 5 m too high", agl_bias_m=5.0),
     Condition("blind 10 s", "no frames for 10 s", blind_s=(100.0, 110.0)),

@@ -226,7 +226,9 @@ def _warnings(facts: dict[str, Any]) -> list[str]:
             f"the camera's times differ from the IMU's by {delay:+.0f} ms (sigma {sigma:.0f}): corrected here; "
             f"add {delay / 1000.0:+.3f} to t_s in frames.csv to correct it everywhere"
         )
-    for axis, angle, error in zip(("roll", "pitch"), facts["boresight_deg"], facts["boresight_sigma_deg"]):
+    for axis, angle, error in zip(
+        ("roll", "pitch", "yaw"), facts["boresight_deg"], facts["boresight_sigma_deg"]
+    ):
         if abs(angle) > max(0.4, 3.0 * error):
             found.append(
                 f"the camera's mount is off by {angle:+.2f} deg in {axis} (sigma {error:.2f}): corrected here; "

@@ -16,12 +16,13 @@ Bloesch et al., "Fusion of optical flow and inertial measurements for robust ego
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any
 
+import cv2
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +36,11 @@ GRAVITY = 9.80665
 WARM_BYTES = 256_000_000
 # Share of the height over which the ground's unevenness pulls steps the same way; by the errors of simulated flights.
 RELIEF_LENGTH = 0.18
+MAX_DELAY_S = 1.5
 # Error state: where each part begins. The clone (position, attitude) is last.
 P, V, TH, BG, BA, TD, BS, CP, CT, SIZE = 0, 3, 6, 9, 12, 15, 16, 19, 22, 25
+# The filter's attributes that a correction replaces; it makes new arrays and leaves the old ones as they are.
+_CORRECTED = ("p", "v", "rot", "gyro_bias", "accel_bias", "delay", "bore", "pk", "rk")
 # What a picture sees of it: all but velocity and the biases.
 _SEEN = np.r_[P : P + 3, TH : TH + 3, TD : TD + 1, BS:SIZE]
 
@@ -396,7 +400,7 @@ class VioFilter:
         up = self.imu.accel_m_s2[near].mean(axis=0)
         roll = math.atan2(up[1], up[2])
         pitch = math.atan2(-up[0], math.hypot(up[1], up[2]))
-        self.t = t_s
+        self.t = t_s + self.delay
         self.p = np.array([0.0, 0.0, agl_m])
         self.v = np.zeros(3)
         self.rot = Attitude(roll, pitch).matrix()
@@ -617,7 +621,7 @@ class VioFilter:
         key, seen = np.ascontiguousarray(pts.key_ray[chosen]), np.ascontiguousarray(rays[chosen, :2])
         base = self._weights(chosen)
         weight = np.zeros(len(chosen))
-        prior = self._state()
+        prior = {name: getattr(self, name) for name in _CORRECTED}
         total = np.zeros(SIZE)
         posterior = self.cov
         for turn in range(2):
@@ -627,13 +631,13 @@ class VioFilter:
             miss = np.where(np.isfinite(miss), miss, 1e3)  # a ray that does not meet the ground
             weight, inliers = _weigh(miss, base, self.focal, turn == 0)
             if inliers < s.min_tracks:
-                self._restore(prior)
+                vars(self).update(prior)
                 return 0
             _tie(*arguments, weight, matrix, vector)
             vector += matrix @ total
             gain = np.linalg.solve(np.eye(SIZE) + self.cov @ matrix, self.cov)
             total = gain @ vector
-            self._restore(prior)
+            vars(self).update(prior)
             self._correct(total)
             posterior = (gain + gain.T) / 2.0
         self.cov = posterior
@@ -650,33 +654,6 @@ class VioFilter:
         moved = math.hypot(*(self.p - self._relief_place)[:2])
         self.relief_walk += RELIEF_LENGTH * relief * moved / max(float(self.p[2]), 1.0)
         self._relief_place = self.p.copy()
-
-    def _state(self) -> tuple[Any, ...]:
-        # All that _correct changes, in its order; it makes new arrays and leaves these as they are.
-        return (
-            self.p,
-            self.v,
-            self.rot,
-            self.gyro_bias,
-            self.accel_bias,
-            self.delay,
-            self.bore,
-            self.pk,
-            self.rk,
-        )
-
-    def _restore(self, state: tuple[Any, ...]) -> None:
-        (
-            self.p,
-            self.v,
-            self.rot,
-            self.gyro_bias,
-            self.accel_bias,
-            self.delay,
-            self.bore,
-            self.pk,
-            self.rk,
-        ) = state
 
     def _drop_strays(self, rays: FloatArray) -> None:
         # Points below the ground or far from where the plane, or their height, puts them: moving cars, wrong matches.
@@ -762,26 +739,76 @@ def _even(
     return np.asarray(np.interp(times, times[at], np.maximum.accumulate(walk[at])))
 
 
+def coarse_delay(
+    times_s: FloatArray, images: Sequence[NDArray[np.uint8]], imu: Imu, camera: Camera, mount: Attitude
+) -> float:
+    """IMU time minus camera time in seconds, to a few hundredths, within +-``MAX_DELAY_S``; 0 where it cannot be told.
+
+    The aircraft's wobble shifts the whole picture, and the gyro reads it as well: the shift from picture to picture (phase
+    correlation: Kuglin & Hines 1975), without its slow part, is held against the gyro's at every delay. The filter's own
+    estimate is fine, but it finds only delays that are short against the wobble.
+
+    Args:
+        times_s: (n,) of the pictures; images: n grey (h, w) uint8.
+        camera, mount, imu: as for ``run_vio``.
+    """
+    n = len(images)
+    if n < 30 or times_s[n - 1] - times_s[0] < 6.0:
+        return 0.0
+    factor = max(1, round(camera.width / 240))
+    small = [cv2.resize(g, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA) for g in images]
+    window = cv2.createHanningWindow((small[0].shape[1], small[0].shape[0]), cv2.CV_32F)
+    floats = [np.asarray(g, dtype=np.float32) for g in small]
+    flow = np.array([cv2.phaseCorrelate(a, b, window)[0] for a, b in itertools.pairwise(floats)]) * factor
+    half = max(2, round(1.0 / float(np.median(np.diff(times_s)))))
+    seen = _without_slow(flow, half)
+    # Pictures that jumped (a wrong peak) must not decide.
+    most = 4.0 * float(np.median(np.abs(seen)))
+    seen = np.clip(seen, -most, most)
+    turned = np.zeros((len(imu.t_s), 3))
+    turned[1:] = np.cumsum(
+        0.5 * (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) * np.diff(imu.t_s)[:, None], axis=0
+    )
+    turned = turned @ mount.body_from_camera()
+    delays = np.arange(-MAX_DELAY_S, MAX_DELAY_S + 0.01, 0.02)
+    fits = np.empty(len(delays))
+    for k, delay in enumerate(delays):
+        at = np.stack([np.interp(times_s[:n] + delay, imu.t_s, turned[:, c]) for c in range(3)], axis=-1)
+        step = np.diff(at, axis=0)
+        told = _without_slow(np.stack([-camera.fx * step[:, 1], camera.fy * step[:, 0]], axis=-1), half)
+        fits[k] = (seen * told).sum() / max(float(np.sqrt((told**2).sum() * (seen**2).sum())), 1e-9)
+    best, none = int(fits.argmax()), int(np.abs(delays).argmin())
+    sure = fits[best] > 0.5 and fits[best] > fits[none] + 0.1
+    return float(delays[best]) if sure else 0.0
+
+
+def _without_slow(values: FloatArray, half: int) -> FloatArray:
+    # (n, 2) minus its mean over 2 half + 1 rows.
+    kernel = np.ones(2 * half + 1)
+    count = np.convolve(np.ones(len(values)), kernel, "same")
+    return values - np.stack([np.convolve(v, kernel, "same") / count for v in values.T], axis=-1)
+
+
 def _warmed(
     vio: VioFilter, times: FloatArray, images: Iterator[NDArray[np.uint8]], agl_m: FloatArray
 ) -> Iterator[NDArray[np.uint8]]:
     # Starts ``vio`` with what a first filter makes of the first seconds; all the images, those first ones again.
     first: list[NDArray[np.uint8]] = []
-    held = 0
-    warm = VioFilter(vio.camera, vio.mount, vio.imu, vio.settings)
-    good = 0
-    for i in range(int(np.searchsorted(times, times[0] + vio.settings.warm_s))):
+    for _ in range(int(np.searchsorted(times, times[0] + vio.settings.warm_s))):
         grey = next(images, None)
         if grey is None:
             break
         first.append(grey)
-        held += grey.nbytes
-        _, blind = warm.frame(float(times[i]), grey, float(agl_m[i]))
-        good += not blind
-        if held > WARM_BYTES:
+        if len(first) * grey.nbytes > WARM_BYTES:
             break
     n = len(first)
-    # A short or a blind beginning teaches nothing.
-    if n > 1 and times[n - 1] - times[0] >= 0.25 * vio.settings.warm_s and good >= 0.9 * n and not blind:
-        vio.start(float(times[0]), float(agl_m[0]), warm)
-    return chain(first, images)
+    if n and vio.settings.delay_sigma_s > 0.0:
+        vio.delay = coarse_delay(times, first, vio.imu, vio.camera, vio.mount)
+    # A short beginning teaches nothing, and neither does a blind one.
+    if n > 1 and times[n - 1] - times[0] >= 0.25 * vio.settings.warm_s:
+        warm = VioFilter(vio.camera, vio.mount, vio.imu, vio.settings)
+        warm.delay = vio.delay
+        blind = [warm.frame(float(times[i]), first[i], float(agl_m[i]))[1] for i in range(n)]
+        if sum(blind) <= 0.1 * n and not blind[-1]:
+            vio.start(float(times[0]), float(agl_m[0]), warm)
+    return itertools.chain(first, images)

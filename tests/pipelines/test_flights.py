@@ -663,6 +663,7 @@ def test_real_flight_without_odometry_is_honest(
     real_maps: Path, tmp_path: Path, say: Callable[..., Said], words: tuple[str, ...]
 ) -> None:
     out = tmp_path / "out"
+    words = ("--odometry", "given", *words)
     said = say("localize", "--maps", real_maps, "--flight", REAL, "--out", out, *words)
     assert said.code == 0, said.err
     metrics = json.loads((out / "metrics.json").read_text())
@@ -671,6 +672,21 @@ def test_real_flight_without_odometry_is_honest(
     if "--max-speed" in words:
         assert metrics["share_converged"] > 0.1
         assert metrics["rmse_after_first_fix_m"] < 1.0
+
+
+@pytest.mark.slow
+def test_real_flight_is_found_by_the_odometry_of_its_own_photos(
+    real_maps: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    out = tmp_path / "out"
+    said = say("localize", "--maps", real_maps, "--flight", REAL, "--out", out)
+    assert said.code == 0, said.err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["odometry"].startswith("made from the frames: embedded planar odometry")
+    assert metrics["odometry_rmse_m"] < 4.0
+    assert metrics["false_fixes"] == 0
+    assert metrics["share_converged"] > 0.5
+    assert metrics["rmse_after_first_fix_m"] < 1.5
 
 
 def test_evaluate_keeps_the_flights_that_were_flown_where_one_breaks_off(

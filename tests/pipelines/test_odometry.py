@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from numpy.typing import NDArray
+from pyproj import Transformer
+from small_maps import BOUNDS, SmallRegion, brmgeo
 
 from brmgeo.errors import FlightError, InputError
 from brmgeo.flight.folder import read_flight
 from brmgeo.flight.motion import motions
 from brmgeo.flight.readings import Attitude, Camera, Imu
 from brmgeo.synth.flight import FlightSettings, Ground, Imagery, simulate
-from pipelines.odometry import checked_imu, make_odometry, summary, thin_flight
+from pipelines.odometry import (
+    checked_imu,
+    make_odometry,
+    odometry_name,
+    own_odometry,
+    summary,
+    thin_flight,
+)
 
 CAMERA = Camera.from_fov(240, 180, 43.0)
 
@@ -91,6 +102,113 @@ def test_planar_needs_no_imu(folder: Path, tmp_path: Path) -> None:
     assert facts["method"] == "planar"
     assert facts["segments"] == 1
     assert facts["length_m"] == pytest.approx(95.0, rel=0.1)
+
+
+def _bare(folder: Path, out: Path) -> Path:
+    """The flight as it came, without odometry."""
+    shutil.copytree(folder, out)
+    for path in out.glob("odometry.*"):
+        path.unlink()
+    toml = out / "flight.toml"
+    toml.write_text(toml.read_text().split("[odometry]")[0])
+    return out
+
+
+def test_localize_makes_odometry_where_there_is_none(folder: Path, tmp_path: Path) -> None:
+    bare = _bare(folder, tmp_path / "bare")
+    flight = read_flight(bare)
+    before = sorted(p.name for p in bare.iterdir())
+    got = own_odometry(flight, 5.0)
+    assert got.says.startswith("made from the frames: embedded visual-inertial odometry, ")
+    assert f"every 5 s one of its {len(flight.frames)} frames" in got.says
+    assert [f.t_s for f in got.flight.frames] == [0.0, 5.0, 10.0, 15.0]
+    assert got.flight.odometry is not None
+    assert len(got.flight.odometry.t_s) == len(flight.frames)
+    steps = motions(got.flight.odometry, got.flight.times_s)
+    assert all(m.step_m is not None and 15.0 < np.hypot(*m.step_m) < 30.0 for m in steps[1:])
+    assert odometry_name(got.flight, "simulated") == got.says
+    assert sorted(p.name for p in bare.iterdir()) == before
+    assert own_odometry(got.flight, 5.0).flight is got.flight
+    assert odometry_name(flight, "simulated") == "none"
+
+    # Readings in g: said, and the flight goes on without.
+    rows = np.loadtxt(bare / "imu.csv", delimiter=",", skiprows=1)
+    rows[:, 4:] /= 9.80665
+    np.savetxt(bare / "imu.csv", rows, "%.6f", ",", header="t_s,gx,gy,gz,ax,ay,az", comments="")
+    wrong = own_odometry(read_flight(bare), 5.0)
+    assert "are in g" in wrong.says
+    assert wrong.flight.odometry is None
+    assert len(wrong.flight.frames) == len(flight.frames)
+
+
+def test_odometry_of_frames_far_apart(folder: Path, tmp_path: Path) -> None:
+    few = thin_flight(_bare(folder, tmp_path / "bare"), tmp_path / "few", 2.5)
+    got = own_odometry(read_flight(few), 5.0)
+    assert got.says.startswith("made from the frames: embedded planar odometry, ")
+    assert len(got.flight.frames) == 8
+    assert got.flight.odometry is not None
+    rng = np.random.default_rng(5)
+    for path in (few / "frames").iterdir():
+        noise = rng.integers(0, 255, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+        cv2.imwrite(str(path), noise)
+    alone = own_odometry(read_flight(few), 5.0)
+    assert "do not overlap" in alone.says
+    assert alone.flight.odometry is None
+
+
+def test_from_simulated_frames_to_a_report_with_no_odometry_given(
+    built: SmallRegion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = tmp_path / "maps"
+    shutil.copytree(built.out, maps)
+    # The small region's imagery is too smooth for points to be followed.
+    with rasterio.open(maps / "imagery.tif") as old:
+        profile = {"driver": "GTiff", "width": old.width, "height": old.height, "count": 3, "dtype": "uint8"}
+        profile |= {"crs": old.crs, "transform": old.transform, "photometric": "RGB"}
+    rng = np.random.default_rng(2)
+    coarse = rng.integers(30, 220, (profile["height"] // 4 + 1, profile["width"] // 4 + 1), dtype=np.uint8)
+    grey = cv2.resize(coarse, (profile["width"], profile["height"]), interpolation=cv2.INTER_CUBIC)
+    (maps / "imagery.tif").unlink()
+    with rasterio.open(maps / "imagery.tif", "w", **profile) as new:
+        new.write(np.repeat(grey[None], 3, axis=0))
+    x, y = (BOUNDS[0] + BOUNDS[2]) / 2, (BOUNDS[1] + BOUNDS[3]) / 2 - 20.0
+    line = tmp_path / "line.geojson"
+    lonlat = Transformer.from_crs("EPSG:5187", "EPSG:4326", always_xy=True)
+    places = [lonlat.transform(*p) for p in ((x - 40.0, y), (x + 10.0, y), (x + 10.0, y - 20.0))]
+    line.write_text(json.dumps({"type": "LineString", "coordinates": places}))
+    words = (
+        "simulate",
+        "--maps",
+        maps,
+        "--path",
+        line,
+        "--no-odometry",
+        "--interval",
+        0.5,
+        "--name",
+        "dense",
+    )
+    said = brmgeo(capsys, *words, "--out", tmp_path / "dense")
+    assert said.status == 0, said.err
+    flight = read_flight(tmp_path / "dense")
+    assert np.allclose(np.diff(flight.times_s), 0.5)
+    assert flight.odometry is None
+
+    words = ("localize", "--maps", maps, "--flight", tmp_path / "dense", "--method", "paper")
+    said = brmgeo(capsys, *words, "--out", tmp_path / "own")
+    assert said.status == 0, said.err
+    assert "dense odometry: made from the frames: embedded visual-inertial odometry" in said.err
+    rows = (tmp_path / "own" / "fixes.csv").read_text().splitlines()[1:]
+    assert len(rows) == int(flight.times_s[-1] / 5.0) + 1
+    made = json.loads((tmp_path / "own" / "metrics.json").read_text())
+    assert made["odometry"].startswith("made from the frames")
+    assert made["odometry_rmse_m"] < 2.0
+    assert made["odometry"] in (tmp_path / "own" / "report.html").read_text()
+
+    said = brmgeo(capsys, *words, "--odometry", "given", "--out", tmp_path / "none")
+    assert said.status == 0, said.err
+    assert "made from the frames" not in said.err
+    assert json.loads((tmp_path / "none" / "metrics.json").read_text())["odometry"] == "none"
 
 
 def _still(n: int = 200) -> Imu:
