@@ -679,7 +679,7 @@ class Belief:
             return np.empty((0, 2)), np.empty(0), 0
         even = 1.0 / self.cells
         top = _mass_of(self.blocks)[:, 1]
-        standing = int(np.count_nonzero(self.blocks > even))
+        standing = self._standing(top, even)
         rows = np.argsort(top)[::-1][:count]
         flat = self.blocks[rows].reshape(-1)
         take = min(count, len(flat))
@@ -693,6 +693,17 @@ class Belief:
         place = place[order]
         centres = np.stack([place // self.shape[1] + 0.5, place % self.shape[1] + 0.5], axis=1)
         return centres, mass[order], max(standing, len(order))
+
+    def _standing(self, top: F64, even: float) -> int:
+        """How many cells hold more than ``even`` under some heading; ``top`` (n,) is the largest mass of each block."""
+        held = np.flatnonzero(top > even)
+        if not len(held):
+            return 0
+        over = np.packbits((self.blocks[held] > even).reshape(len(held), -1), axis=1)
+        place = self.keys[held, 1].astype(np.int64) * self.grid[1] + self.keys[held, 2]
+        order = np.argsort(place, kind="stable")
+        starts = np.flatnonzero(np.diff(place[order], prepend=-1))
+        return int(np.unpackbits(np.bitwise_or.reduceat(over[order], starts, axis=0)).sum(dtype=np.int64))
 
     def mode(self, radius: float) -> Mode | None:
         """The heaviest place within ``radius`` cells; None when nothing is listed."""

@@ -4,7 +4,8 @@ Each frame's state is x, y, heading of the odometry frame and log scale (``brmge
 links neighbours, registered poses anchor; the least-squares problem is solved by Gauss-Newton with robust
 weights on the anchors, and each linear problem by forward and backward elimination of its block-tridiagonal
 normal matrix, which also gives every frame's covariance. A step without odometry cuts the chain; a piece
-without an anchor has no place: its rows are NaN with infinite sigma.
+without an anchor has no place, nor has a frame whose sigma exceeds ``MOST_SIGMA_M``: its rows are NaN with infinite
+sigma.
 
 In a second round the frames without an anchor are registered about the smoothed poses: seen from behind, the
 part before the first fix is as well known as the rest.
@@ -26,6 +27,11 @@ from brmgeo.match.track import advance, wrap
 
 F64 = NDArray[np.float64]
 
+#: Beyond this a place is none: one fix whose heading is open says nothing of where the frames about it were.
+MOST_SIGMA_M = 200.0
+#: A yaw whose variance exceeds this is as good as unknown; pi^2 stands for no yaw at all.
+MOST_YAW_VARIANCE = 1.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedPath:
@@ -33,7 +39,8 @@ class SmoothedPath:
 
     Attributes:
         t_s: (n,) times of the views, seconds.
-        xy: (n, 2) places in the map frame, metres; NaN where nothing anchors that part of the flight.
+        xy: (n, 2) places in the map frame, metres; NaN where nothing anchors that part of the flight, or so loosely that
+            sigma would exceed 200 m.
         yaw_rad: (n,) yaw of the body in the map frame; NaN where unknown.
         sigma_m: (n,) root of half the trace of the place's covariance, metres; infinite where ``xy`` is NaN.
     """
@@ -88,25 +95,41 @@ def smooth_path(
             found = False
             for k, i in enumerate(span):
                 if anchors[i] is None and register is not None:
-                    mean, cov = solved[0][k], solved[1][k]
-                    pose = mean[:3].copy()
-                    pose[2] = wrap(float(mean[2]) + (motions[i].yaw_rad or 0.0))
-                    anchors[i] = register(i, pose, cov[:3, :3])
+                    about = _about(motions[i], solved[0][k], solved[1][k], settings)
+                    anchors[i] = None if about is None else register(i, *about)
                     found |= anchors[i] is not None
             if not found:
                 break
             solved = piece.solve([anchors[i] for i in span])
         for k, i in enumerate(span):
             mean, cov = solved[0][k], solved[1][k]
-            xy[i] = mean[:2]
+            spread = math.sqrt(max(0.0, float(cov[0, 0] + cov[1, 1])) / 2.0)
+            if spread > MOST_SIGMA_M:
+                continue
+            xy[i], sigma[i] = mean[:2], spread
             body = motions[i].yaw_rad
             anchor = anchors[i]
             if body is not None:
-                yaw[i] = wrap(float(mean[2]) + body)
-            elif anchor is not None:
+                if float(cov[2, 2]) <= MOST_YAW_VARIANCE:
+                    yaw[i] = wrap(float(mean[2]) + body)
+            elif anchor is not None and float(anchor.covariance[2, 2]) <= MOST_YAW_VARIANCE:
                 yaw[i] = wrap(float(anchor.pose[2]))
-            sigma[i] = math.sqrt(max(0.0, float(cov[0, 0] + cov[1, 1])) / 2.0)
     return SmoothedPath(np.asarray(times_s, np.float64), xy, yaw, sigma)
+
+
+def _about(motion: Motion, mean: F64, covariance: F64, settings: OdometrySettings) -> tuple[F64, F64] | None:
+    """(3,) x, y, yaw of the body about which a view is registered and its (3, 3) covariance; None where the yaw is not known."""
+    pose, spread = mean[:3].copy(), covariance[:3, :3].copy()
+    if motion.yaw_rad is not None:
+        pose[2] = wrap(float(mean[2]) + motion.yaw_rad)
+        return pose, spread
+    if motion.compass_yaw_rad is None:
+        # The heading of the odometry's frame is not the body's yaw.
+        return None
+    pose[2] = motion.compass_yaw_rad
+    spread[2, :] = spread[:, 2] = 0.0
+    spread[2, 2] = settings.compass_sigma_rad**2
+    return pose, spread
 
 
 class _Piece:
