@@ -105,14 +105,15 @@ class NetworkUse:
     Attributes:
         wanted: ``given`` masks where the flight has them, else the network; or the ``network`` in any case.
         weights: their file; None for those that ship with brmgeo. A file means the network in any case.
-        answer: hand the matcher masks or probabilities.
+        answer: hand the matcher masks or probabilities. Masks are the better evidence: a frame's fit to the map tells
+            right from wrong two to four times as clearly as with probabilities, and lies as near to the truth.
         cache: folder in which answers are kept; None keeps none beyond the run.
         roof_m: height above ground of the roofs it finds.
     """
 
     wanted: Literal["given", "network"] = "given"
     weights: Path | None = None
-    answer: Answer = "probability"
+    answer: Answer = "mask"
     cache: Path | None = None
     roof_m: float = ROOF_M
 
@@ -350,16 +351,7 @@ def _segment_pictures(
         raise SettingsError(
             f"--out {out}: there are other files than masks; give a new folder or an empty one"
         )
-    progress = Progress()
-    share = 0.0
-    with progress.stage("masks") as bar:
-        for done, (job, name) in enumerate(zip(jobs, names, strict=True), start=1):
-            probability = segmenter.probability(job.picture(), job.gsd_m)
-            mask = mask_of(probability, segmenter.card.threshold)
-            _write_png(out / name, mask if answer == "mask" else _stored(probability))
-            share += float((mask > 0).mean()) / len(jobs)
-            bar.update(done, len(jobs))
-    facts = {
+    facts: dict[str, Any] = {
         "source": str(source),
         "answer": answer,
         "values": "0 other, 255 building" if answer == "mask" else "0 to 254 for 0 to 1, 255 unknown",
@@ -368,10 +360,28 @@ def _segment_pictures(
         "backend": segmenter.backend,
         "threshold": segmenter.card.threshold,
         "images": len(jobs),
-        "building_share": round(share, 6),
+        "finished": False,
     }
-    (out / SIGN).write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    progress = Progress()
+    share = 0.0
+    # Before the masks, so that the same command may go on where one was killed.
+    _write_facts(out, facts)
+    with progress.stage("masks") as bar:
+        for done, (job, name) in enumerate(zip(jobs, names, strict=True), start=1):
+            probability = segmenter.probability(job.picture(), job.gsd_m)
+            mask = mask_of(probability, segmenter.card.threshold)
+            _write_png(out / name, mask if answer == "mask" else _stored(probability))
+            share += float((mask > 0).mean()) / len(jobs)
+            bar.update(done, len(jobs))
+    _write_facts(out, {**facts, "finished": True, "building_share": round(share, 6)})
     return f"wrote {len(jobs)} of {answer} into {out}; {share:.1%} building; network {segmenter.name}"
+
+
+def _write_facts(out: Path, facts: dict[str, Any]) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    part = out / f".{SIGN}.part"
+    part.write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    part.replace(out / SIGN)
 
 
 # --- rasters -----------------------------------------------------------------------------------------------------

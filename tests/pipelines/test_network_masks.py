@@ -286,6 +286,7 @@ def test_segment_a_flight_and_a_folder(
     flight = job.read_flight(pictured)
     facts = json.loads((tmp_path / "masks" / job.SIGN).read_text())
     assert facts["images"] == len(flight.frames)
+    assert facts["finished"]
     assert facts["weights"] == "ab" * 32
     # They are masks by the letter of docs/FLIGHT.md.
     given = Path(shutil.copytree(pictured, tmp_path / "given"))
@@ -309,7 +310,12 @@ def test_segment_a_flight_and_a_folder(
     assert (b == 0).all()
     (folder / "a.tif").write_bytes((folder / "a.png").read_bytes())
     assert "differ only in their ending" in say(*words).line
+    (folder / "a.tif").write_text("no picture")
+    (folder / "a.png").rename(folder / "z.png")
+    killed = ("segment", folder, "--weights", weights, "--out", tmp_path / "k")
+    assert "cannot be decoded" in say(*killed).line
     (folder / "a.tif").unlink()
+    assert say(*killed).code == 0, "the same command goes on"
     assert "other files" in say(*words[:-1], folder).line
     (tmp_path / "none").mkdir()
     assert (
