@@ -935,4 +935,9 @@ def _paired(images: Path, masks: Path) -> list[tuple[str, str, str]]:
             f"tiles --pairs: {len(lonely)} pictures have no partner, such as {lonely[0]}, which {where} lacks; "
             "images and masks have the same names"
         )
-    return [(maps._safe_name(stem), name, labels[stem]) for stem, name in sorted(pictures.items())]
+    safe = Counter(maps._safe_name(stem) for stem in pictures)
+    return [
+        # Names that differ only in what a key cannot hold get a number.
+        (maps._safe_name(stem) + (f"-{i:05d}" if safe[maps._safe_name(stem)] > 1 else ""), name, labels[stem])
+        for i, (stem, name) in enumerate(sorted(pictures.items()))
+    ]

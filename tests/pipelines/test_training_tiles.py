@@ -401,6 +401,14 @@ def test_pairs_become_tiles_as_they_are(pairs: tuple[Path, Path], capsys: Captur
     assert "start" not in make(capsys, pairs, "--terms", "CC BY 4.0", "--name", "city").err
 
 
+def test_names_that_a_key_cannot_tell_apart_get_numbers(pairs: tuple[Path, Path], capsys: Capture) -> None:
+    for folder in pairs:
+        shutil.copy(folder / "p 1.png", folder / "p-1.png")
+    assert make(capsys, pairs).status == 0
+    keys = [info.key for info in read_tiles(pairs[0].parent / "out").infos]
+    assert len(set(keys)) == len(keys) == 5
+
+
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
