@@ -34,7 +34,7 @@ from brmgeo.evaluate.scores import Scores, dead_reckoning, score
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
 from brmgeo.export.cog import box_of, read_overview, read_window
 from brmgeo.flight.folder import Flight, read_flight
-from brmgeo.flight.motion import motions
+from brmgeo.flight.motion import RESET_SPEED_M_S, motions
 from brmgeo.flight.readings import Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
@@ -228,7 +228,7 @@ def localize(
     if max_speed_m_s is not None:
         own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
     settings = match_settings(own)
-    steps = motions_of(flight, yaws)
+    steps = motions_of(flight, yaws, own.max_speed_m_s)
     source = _source_of(flight)
     with frame_masks(
         flight, f"{source}: masks/ of the flight folder", network or NetworkUse(), progress
@@ -253,9 +253,19 @@ def _middle(maps: Maps) -> tuple[float, float]:
     return (left + right) / 2, (bottom + top) / 2
 
 
-def motions_of(flight: Flight, compass_yaw_rad: list[float | None] | None = None) -> list[Motion]:
-    """The flight's motions, with what a trusted compass says of each frame."""
-    return motions(flight.odometry, flight.times_s, compass_yaw_rad=compass_yaw_rad)
+def motions_of(
+    flight: Flight, compass_yaw_rad: list[float | None] | None = None, max_speed_m_s: float = RESET_SPEED_M_S
+) -> list[Motion]:
+    """The flight's motions, with what a trusted compass says of each frame.
+
+    Odometry that moves faster than ``max_speed_m_s``, and than ``RESET_SPEED_M_S``, was reset there.
+    """
+    return motions(
+        flight.odometry,
+        flight.times_s,
+        compass_yaw_rad=compass_yaw_rad,
+        max_speed_m_s=max(RESET_SPEED_M_S, max_speed_m_s),
+    )
 
 
 def _source_of(flight: Flight) -> str:

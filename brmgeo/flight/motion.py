@@ -16,6 +16,8 @@ from brmgeo.flight.values import Motion
 
 #: Standard deviation of a visual-inertial step per axis after one second; it grows with the root of time.
 STEP_NOISE_M = 0.1
+#: Odometry that moves faster than this was reset: no small aircraft does.
+RESET_SPEED_M_S = 60.0
 #: Not even a step that the odometry is sure of is better than this.
 MIN_STEP_NOISE_M = 0.02
 
@@ -65,7 +67,7 @@ def motions(
     *,
     compass_yaw_rad: Sequence[float | None] | None = None,
     max_gap_s: float = 1.0,
-    max_speed_m_s: float = 60.0,
+    max_speed_m_s: float = RESET_SPEED_M_S,
     step_noise_m: float = STEP_NOISE_M,
 ) -> list[Motion]:
     """One Motion a frame: the step from the frame before it, in the odometry frame, and the yaw at it.
