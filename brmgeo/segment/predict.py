@@ -84,24 +84,12 @@ def scaled_levels(image: NDArray[Any], low: float, high: float) -> U8:
     return out
 
 
-def read_image(path: Path, data: bytes | None = None, levels: tuple[float, float] | None = None) -> Picture:
-    """The picture in an image file, sensor's rows and columns (an EXIF turn is not applied).
-
-    Args:
-        data: the file's bytes where they are at hand.
-        levels: the levels that are black and white in a file of more than 8 bits.
-
-    Raises MissingInputError or InputError, naming the file, where it is not there, cut short, damaged, no image, of more
-    than 8 bits without ``levels``, or too small.
-    """
+def require_whole(path: Path, data: bytes) -> None:
+    """Raises InputError, naming the file, for the bytes of a picture that is empty, damaged or cut short."""
     from io import BytesIO
 
     from PIL import Image
 
-    if data is None:
-        if not path.is_file():
-            raise MissingInputError(f"{path}: there is no such image")
-        data = path.read_bytes()
     if not data:
         raise InputError(f"{path}: the file is empty: copy it again")
     # OpenCV fills up what is missing of a JPEG with grey and says nothing; Pillow refuses it.
@@ -118,6 +106,23 @@ def read_image(path: Path, data: bytes | None = None, levels: tuple[float, float
         # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
         if data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error):
             raise InputError(f"{path}: damaged or cut short ({error}): copy the file again") from None
+
+
+def read_image(path: Path, data: bytes | None = None, levels: tuple[float, float] | None = None) -> Picture:
+    """The picture in an image file, sensor's rows and columns (an EXIF turn is not applied).
+
+    Args:
+        data: the file's bytes where they are at hand.
+        levels: the levels that are black and white in a file of more than 8 bits.
+
+    Raises MissingInputError or InputError, naming the file, where it is not there, cut short, damaged, no image, of more
+    than 8 bits without ``levels``, or too small.
+    """
+    if data is None:
+        if not path.is_file():
+            raise MissingInputError(f"{path}: there is no such image")
+        data = path.read_bytes()
+    require_whole(path, data)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InputError(f"{path}: the image cannot be decoded: copy it again, or convert it to PNG or JPEG")
