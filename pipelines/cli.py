@@ -753,7 +753,12 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
     help="Axes of the odometry.",
 )
 @click.option("--imu-units", help="Units of the log's IMU where they are others: deg/s, g or mg, by commas.")
-@click.option("--rate", "rate_hz", type=float, help="Take at most this many frames a second.")
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Take at most this many frames a second.",
+)
 @click.option("--shift-frames", type=float, default=0.0, help="Seconds to add to the frames' times.")
 def import_(
     log: Path,
@@ -781,6 +786,7 @@ def import_(
 ) -> None:
     """Make a flight folder of LOG: a ROS bag, PX4 or ArduPilot log, text of poses, or a folder of geotagged photos."""
     from brmgeo.flight.logs import LogOptions
+    from brmgeo.flight.tables import read_times
     from pipelines import logs as job
 
     units = tuple(u.strip() for u in (imu_units or "").split(",") if u.strip())
@@ -792,7 +798,7 @@ def import_(
             f"import: --camera has {len(camera)} numbers: give fx,fy,cx,cy or these and k1,k2,p1,p2,k3"
         )
     options = LogOptions(
-        topic, image_topic, imu_topic, quaternion, job.times_of(times) if times else None, format_name
+        topic, image_topic, imu_topic, quaternion, read_times(times) if times else None, format_name
     )
     settings = job.ImportSettings(
         options, name, photos, video, video_start, fov_deg, camera, agl_m, ground_m, mount, body, axes, units, rate_hz,
@@ -811,22 +817,22 @@ def import_(
 def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, write: Path | None) -> None:
     """Tell what is in PATHS (logs, bags, photo or flight folders): how long, how far, where, gaps, rates, units, faults."""
     from brmgeo.flight.logs import LogOptions
+    from brmgeo.flight.tables import read_times
     from pipelines import logs as job
 
+    options = LogOptions(topic, frame_times_s=read_times(times) if times else None)
+    unread = 0
     if write is not None:
-        text = job.inspect_document(paths)
         if not write.absolute().parent.is_dir():
             raise SettingsError(
                 f"inspect --write {write}: there is no folder {write.parent}; make it or choose another"
             )
+        text, unread = job.inspect_document(paths, options)
         part = write.with_name(f".{write.name}.part")
         part.write_text(text, encoding="utf-8")
         part.replace(write)
         click.echo(f"wrote {write}")
-        return
-    options = LogOptions(topic, frame_times_s=job.times_of(times) if times else None)
-    unread = 0
-    for path in paths:
+    for path in paths if write is None else ():
         try:
             for line in job.inspect(path, options):
                 click.echo(line)
@@ -870,6 +876,19 @@ def main() -> None:
     sys.exit(run(lambda: cli(standalone_mode=False)))
 
 
+#: What is wrong with a place, not with the program, and what to do about it.
+_PLACES = (
+    dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room or choose another place")
+    | dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS), "give yourself the right to, or choose another place"
+    )
+    | dict.fromkeys(
+        (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOENT, errno.ENAMETOOLONG),
+        "check the path, or choose another",
+    )
+)
+
+
 def run(command: Callable[[], Any]) -> int:
     """Exit status of a command: 0, 2 for a known error (one line on stderr), 130 when interrupted."""
     try:
@@ -896,11 +915,11 @@ def run(command: Callable[[], Any]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT, errno.EPERM):
+        if error.errno not in _PLACES:
             raise
+        name = error.filename2 or error.filename or "a file"
         click.echo(
-            f"brmgeo: {error.filename or 'a file'} cannot be written: {error.strerror}; make room or choose another place",
-            err=True,
+            f"brmgeo: {name} cannot be read or written: {error.strerror}; {_PLACES[error.errno]}", err=True
         )
         return 2
     return 0

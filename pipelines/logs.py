@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import FlightError, InputError, SettingsError
 from brmgeo.flight import checks, frames
-from brmgeo.flight.folder import MAX_AGL_M, MAX_MEDIAN_TILT_DEG, MIN_AGL_M, read_flight
+from brmgeo.flight.folder import MAX_AGL_M, MAX_MEDIAN_TILT_DEG, MIN_AGL_M, Flight, read_flight
 from brmgeo.flight.logs import Height, Log, LogOptions, Orientation, kind_of, read_log
 from brmgeo.flight.motion import breaks, slerp
 from brmgeo.flight.readings import Camera, FloatArray, Imu, Odometry
-from brmgeo.flight.tables import number, read_rows
 from brmgeo.geo.crs import LONLAT
 
 #: Attitude and height are interpolated across at most this.
@@ -57,19 +56,14 @@ class ImportSettings:
     shift_frames_s: float = 0.0
 
 
-def times_of(path: Path) -> FloatArray:
-    """(n,) float64 seconds of a text file whose first column is the time (KITTI's times.txt, TUM's rgb.txt)."""
-    cells, lines = read_rows(path, None, range(1, 100))
-    return np.array([number(path, line, 1, row[0]) for line, row in zip(lines, cells)])
-
-
 # ---------------------------------------------------------------- import
 
 
 def import_log(path: Path, out: Path, settings: ImportSettings | None = None) -> list[str]:
     """Writes the flight folder ``out`` of a log, bag or folder of photos; what was done, a line each.
 
-    Raises an InputError, one line, for everything that stands in the way: see the issue's list in the tests.
+    Raises an InputError, one line, for everything that stands in the way: clocks, units and axes that cannot be right,
+    a missing height or camera, pictures that do not fit the log, and an ``out`` that is not empty.
     """
     settings = settings or ImportSettings()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -101,7 +95,17 @@ def import_log(path: Path, out: Path, settings: ImportSettings | None = None) ->
         work.rename(out)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return [*lines, *log.notes, *_dropouts(log)]
+    return [*lines, *_left_out(log, settings), *log.notes, *log.faults, *_dropouts(log)]
+
+
+def _left_out(log: Log, settings: ImportSettings) -> list[str]:
+    # Options that this log or video has no use for.
+    out: list[str] = []
+    if _of_camera(log) and any(settings.mount_deg):
+        out.append("--mount was left out: the photos tell the camera's own attitude (gimbal), so it has none")
+    if settings.video is not None and settings.shift_frames_s:
+        out.append("--shift-frames was left out: with --video, --video-start says when its frames were taken")
+    return out
 
 
 def normal(path: Path, log: Log, settings: ImportSettings | None = None) -> Log:
@@ -707,8 +711,17 @@ def _inspect_flight(path: Path) -> list[str]:
     lines += _track_lines(flight.odometry, log) if flight.odometry is not None else ["  odometry   none"]
     if log.imu is not None:
         lines += _imu_lines(log)
-    lines.append(f"  reference  {'yes' if flight.has_reference else 'none'}")
+    lines.append(f"  reference  {_where(flight)}")
     return lines + [f"  FAULT      {fault}" for fault in faults_of(log)]
+
+
+def _where(flight: Flight) -> str:
+    reference = flight.reference(LONLAT)
+    if reference is None:
+        return "none: nothing here says where it was flown"
+    lon, lat = reference.xy_m.mean(axis=0)
+    told = "" if reference.sigma_m is None else f", accuracy {np.median(reference.sigma_m):.2f} m"
+    return f"{_span(reference.t_s)}, about {lat:.5f} N {lon:.5f} E{told}"
 
 
 def pairs(paths: Sequence[Path], options: LogOptions | None = None) -> list[str]:
@@ -728,15 +741,13 @@ def pairs(paths: Sequence[Path], options: LogOptions | None = None) -> list[str]
     return out
 
 
-def inspect_document(paths: Sequence[Path]) -> str:
-    """Markdown of ``inspect`` for many paths: how docs/logs.md is made."""
+def inspect_document(paths: Sequence[Path], options: LogOptions | None = None) -> tuple[str, int]:
+    """Markdown of ``inspect`` for many paths, and how many of them could not be read: how docs/logs.md is made."""
     out = [
-        "# What the readers make of real logs",
+        "# What is in these logs",
         "",
-        "Made by `brmgeo inspect ../shared/data/logs/* ../shared/data/photos-dji --write docs/logs.md`; the logs and",
-        "their licences are listed in `../shared/data/logs/SOURCE.txt`, none is part of this project.",
-        "",
-        "`brmgeo inspect PATH` tells this of any log; `brmgeo import PATH --out flight/` makes a flight folder of it",
+        "Made by `brmgeo inspect PATH ... --write FILE`, which tells this of any log, bag, text of poses, folder of photos",
+        "or flight folder. `brmgeo import PATH --out flight/` makes a flight folder of a log",
         "(`pip install 'brmgeo[logs]'` for ROS bags, PX4 and ArduPilot logs). FAULT is what import refuses, with the",
         "option that mends it. A log without pictures takes them from `--photos` (by its camera triggers) or `--video`.",
         "",
@@ -744,15 +755,15 @@ def inspect_document(paths: Sequence[Path]) -> str:
     others = []
     for path in paths:
         try:
-            lines = inspect(path)
+            lines = inspect(path, options)
         except InputError as error:
             others.append(f"- {str(error).replace(str(path), path.name)}")
             continue
         out += [f"## {path.name}", "", "```", *lines, "```", ""]
-    same = pairs(paths)
+    same = pairs(paths, options)
     if same:
         out += ["## Tracks of the same minutes", "", "After the best rotation, shift and scale:", ""]
         out += [f"- {line}" for line in same] + [""]
     if others:
         out += ["## Not read", "", *others, ""]
-    return "\n".join(out)
+    return "\n".join(out), len(others)

@@ -6,9 +6,12 @@ reference is read only when it is asked for, by name, so nothing that estimates 
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import re
 import tomllib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -20,9 +23,10 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from brmgeo.errors import CrsError, FlightError
+from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
-from brmgeo.flight.tables import Table, nearest, read_table, read_text, refuse
+from brmgeo.flight.tables import Table, nearest, read_table, read_text, read_times, refuse
 from brmgeo.geo.crs import LONLAT, convergence_rad, crs_name, parse_crs, transformer
 
 MIN_AGL_M, MAX_AGL_M = 1.0, 5000.0
@@ -30,12 +34,15 @@ MAX_ALTIMETER_GAP_S = 5.0
 #: More than this between the body's z axis and up, in the middle of a flight, is another frame, not an attitude.
 MAX_MEDIAN_TILT_DEG = 60.0
 
+#: What the odometry.json of a track says that was made from the flight's own frames.
+MADE_BY = "brmgeo odometry"
+
 _KEYS: dict[str, dict[str, type]] = {
     "camera": {"width": int, "height": int, "distortion": list}
     | dict.fromkeys(("fov_deg", "fx", "fy", "cx", "cy"), float),
     "mount": {"roll_deg": float, "pitch_deg": float, "yaw_deg": float},
     "frames": {"video": str, "start_s": float},
-    "odometry": {"file": str, "format": str, "quaternion": str, "topic": str, "covariance": str},
+    "odometry": dict.fromkeys(("file", "format", "quaternion", "topic", "times", "covariance"), str),
     "height": {"source": str, "fixed_m": float},
     "altimeter": {"file": str, "datum": str, "ground_m": float},
     "reference": {"file": str, "crs": str},
@@ -90,10 +97,10 @@ class Flight:
             )
         path = self.folder / "frames" / frame.file
         # The sensor's own rows and columns: an EXIF turn would swap them under the calibration.
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise FlightError(
-                f"{path}: the image cannot be decoded: copy it again or remove its row from frames.csv"
+                f"{path}: the image cannot be decoded, or is cut short: copy it again or remove its row from frames.csv"
             )
         _check_size(path, (image.shape[1], image.shape[0]), self.camera)
         return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
@@ -106,9 +113,9 @@ class Flight:
         path = self.folder / "masks" / _mask_name(self.frames[index].file)
         if not self.has_masks:
             raise FlightError(f"{path}: a mask is asked for, but this flight has no masks")
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = _decoded(path, cv2.IMREAD_UNCHANGED)
         if image is None:
-            raise FlightError(f"{path}: the mask cannot be decoded: write it again")
+            raise FlightError(f"{path}: the mask cannot be decoded, or is cut short: write it again")
         if image.ndim == 3:
             if not (image[:, :, :3] == image[:, :, :1]).all():
                 raise FlightError(f"{path}: the mask is in colour: 0 is other, 255 is building, nothing else")
@@ -218,8 +225,12 @@ class Flight:
         return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
 
 
-def read_flight(folder: Path | str) -> Flight:
+def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
     """The flight in a folder.
+
+    Args:
+        folder: where flight.toml and frames.csv lie.
+        with_odometry: False leaves the odometry out, whatever state it is in.
 
     Raises FlightError, with file, line and column, at the first thing that is not as it should be.
     """
@@ -255,7 +266,7 @@ def read_flight(folder: Path | str) -> Flight:
         folder / "masks", masks, table, camera, optional=False
     )
 
-    odometry = _odometry(toml, folder, mount, frames, times)
+    odometry = _odometry(toml, folder, mount, frames, times) if with_odometry else None
     reference = _reference(toml, folder)
     return Flight(
         folder,
@@ -403,6 +414,18 @@ def _camera(toml: _Toml) -> Camera:
             "distortion",
             "these coefficients fold the image over itself before its corner: check them",
         )
+    # The tangential part may fold it as well: every pixel, to the edge, must have one ray.
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
+    pixels = np.concatenate([np.stack([u.ravel(), v.ravel()], axis=-1), border_pixels(camera)])
+    try:
+        with np.errstate(all="ignore"):
+            ray_from_pixel(camera, pixels)
+    except ValueError:
+        raise toml.refuse(
+            "camera",
+            "distortion",
+            "these coefficients fold the image over itself: check them, p1 and p2 above all",
+        ) from None
     return camera
 
 
@@ -517,6 +540,30 @@ def _check_size(path: Path, size: tuple[int, int], camera: Camera) -> None:
         )
 
 
+def _decoded(path: Path, flags: int) -> NDArray[Any] | None:
+    # None for what is no whole picture.
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FlightError(f"{path}: the picture cannot be read ({error.strerror})") from None
+    return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if _is_whole(data) else None
+
+
+def _is_whole(data: bytes) -> bool:
+    # OpenCV fills up what is missing of a picture with grey and says nothing; Pillow refuses it, but decodes it again.
+    if data.endswith((b"\xff\xd9", b"IEND\xaeB`\x82")):
+        return True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large pictures and odd tags, which do not matter here
+            with Image.open(io.BytesIO(data)) as image:
+                image.load()
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
+        return not (data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error))
+    return True
+
+
 def _check_files(folder: Path, names: Sequence[str], table: Table, camera: Camera, *, optional: bool) -> bool:
     # All there: True. None there and that is allowed: False.
     missing = [i for i, name in enumerate(names) if not (folder / name).is_file()]
@@ -559,9 +606,10 @@ def _open_video(path: Path) -> Any:
 def _odometry(
     toml: _Toml, folder: Path, mount: Attitude, frames: tuple[Frame, ...], times: FloatArray
 ) -> Odometry | None:
-    if not toml.section("odometry"):
+    if "odometry" not in toml.data:
         stray = sorted(folder.glob("odometry.*"))
-        if stray:
+        # `brmgeo odometry` names its track in flight.toml last: a run that was killed before leaves files of its own.
+        if stray and not is_own_odometry(folder):
             raise refuse(
                 toml.path,
                 None,
@@ -576,8 +624,17 @@ def _odometry(
         raise toml.refuse("odometry", "quaternion", f"quaternion is {order!r}: it must be 'xyzw' or 'wxyz'")
     topic = toml.text("odometry", "topic") if toml.has("odometry", "topic") else None
     body = mount.body_from_camera()
-    level = Attitude(frames[0].roll_rad, frames[0].pitch_rad).matrix() @ body
-    odometry = read_odometry(path, format_name, OdometryOptions(order, times, level, body, topic))
+    told = None
+    if toml.has("odometry", "times"):
+        if format_name != "kitti":
+            raise toml.refuse(
+                "odometry", "times", f"times are given, but {format_name} has its own: remove 'times'"
+            )
+        told = read_times(folder / toml.text("odometry", "times"))
+    first = frames[0 if told is None else int(np.abs(times - told[0]).argmin())]
+    level = Attitude(first.roll_rad, first.pitch_rad).matrix() @ body
+    options = OdometryOptions(order, times if told is None else told, level, body, topic, told is not None)
+    odometry = read_odometry(path, format_name, options)
     if toml.has("odometry", "covariance"):
         odometry = _covariance(folder / toml.text("odometry", "covariance"), odometry)
     _check_overlap(path, "odometry", odometry.t_s, times)
@@ -589,6 +646,15 @@ def _odometry(
             "body (x nose, y left, z up) in a frame with z up: check quaternion (xyzw or wxyz) in [odometry], or turn them"
         )
     return odometry
+
+
+def is_own_odometry(folder: Path) -> bool:
+    """True where odometry.json says that ``brmgeo odometry`` makes, or made, the flight's odometry from its frames."""
+    try:
+        facts = json.loads((folder / "odometry.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(facts, dict) and facts.get("made_by") == MADE_BY
 
 
 def _covariance(path: Path, odometry: Odometry) -> Odometry:

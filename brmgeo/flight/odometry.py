@@ -29,11 +29,12 @@ class OdometryOptions:
 
     Attributes:
         quaternion: order of the quaternion where it is not the format's own.
-        frame_times_s: (n,) times of the frames, for formats without times.
+        frame_times_s: (n,) times of the poses, for formats without times; those of the frames where none are told.
         level_from_camera: (3, 3) rotation from the optical frame to the level frame at the first frame, for
             formats in the camera's frame.
         body_from_camera: (3, 3) the camera's mount, for the same.
         topic: which of several, for logs that hold more than one odometry.
+        own_times: ``frame_times_s`` are from a file of the poses' own.
     """
 
     quaternion: QuaternionOrder | None = None
@@ -41,6 +42,7 @@ class OdometryOptions:
     level_from_camera: FloatArray = field(default_factory=lambda: BODY_FROM_NADIR_CAMERA)
     body_from_camera: FloatArray = field(default_factory=lambda: BODY_FROM_NADIR_CAMERA)
     topic: str | None = None
+    own_times: bool = False
 
 
 Reader = Callable[[Path, OdometryOptions], Odometry]
@@ -191,13 +193,15 @@ def _read_kitti(path: Path, options: OdometryOptions) -> Odometry:
     cells, lines = read_rows(path, None, range(12, 13))
     times = options.frame_times_s
     if times is None or len(times) != len(cells):
-        have = "no frames" if times is None else f"{len(times)} frames"
-        raise refuse(
-            path,
-            None,
-            None,
-            f"{len(cells)} poses for {have}: KITTI has no times, so it needs one pose a frame",
-        )
+        if times is not None and options.own_times:
+            message = f"{len(cells)} poses for {len(times)} times: the file of times is of another track"
+        else:
+            have = "no frames" if times is None else f"{len(times)} frames"
+            message = (
+                f"{len(cells)} poses for {have}: KITTI has no times, so it needs one pose a frame, or a file of times "
+                "(times in [odometry] of flight.toml, or --times)"
+            )
+        raise refuse(path, None, None, message)
     poses = np.array([[number(path, n, k + 1, c) for k, c in enumerate(r)] for r, n in zip(cells, lines)])
     poses = poses.reshape(-1, 3, 4)
     rotation = poses[:, :, :3]

@@ -159,6 +159,17 @@ def read_table(
     return Table(path, numbers, texts, lines)
 
 
+def read_times(path: Path) -> FloatArray:
+    """(n,) float64 seconds of a text file whose first column is the time (KITTI's times.txt, TUM's rgb.txt).
+
+    Raises FlightError where it is missing, holds no numbers, or the times do not increase.
+    """
+    cells, lines = read_rows(path, None, range(1, 100))
+    times = np.array([number(path, line, 1, row[0]) for line, row in zip(lines, cells)])
+    check_increasing(path, times, lines, 1)
+    return times
+
+
 def read_rows(path: Path, separator: str | None, widths: range) -> tuple[list[list[str]], list[int]]:
     """Cells and line numbers of a table without a header; '#' lines and blank lines are left out.
 

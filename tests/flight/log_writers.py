@@ -206,6 +206,8 @@ def bag(
                         data=np.ascontiguousarray(pixels).ravel(),
                     )
                     send("/camera/image_raw", message, t)
+                    if "second image" in topics:
+                        send("/right/image_raw", message, t)
             if "info" in topics and i == 0:
                 small = not ros1
                 region = make(
@@ -428,8 +430,11 @@ def as_text(path: Path) -> Path:
     return path.with_suffix(".log")
 
 
-def telemetry(path: Path) -> Path:
-    """A .tlog as a ground station writes it: Unix microseconds, big endian, then the packet."""
+def telemetry(path: Path, *, empty: str | None = None) -> Path:
+    """A .tlog as a ground station writes it: Unix microseconds, big endian, then the packet.
+
+    ``empty`` names a message whose numbers are all NaN, as of a filter without a position.
+    """
     from pymavlink.dialects.v20 import ardupilotmega as mav
 
     link = mav.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -442,8 +447,13 @@ def telemetry(path: Path) -> Path:
     for i in range(N):
         ms = int(US[i] // 1000)
         y, p, r = (float(v) for v in np.radians(NED_YPR_DEG[i]))
-        send(i, mav.MAVLink_attitude_message(ms, r, p, y, 0.0, 0.0, 0.0))
-        send(i, mav.MAVLink_local_position_ned_message(ms, *map(float, NED[i]), 0.0, 0.0, 0.0))
+        nan = float("nan")
+        turn = (nan, nan, nan) if empty == "attitude" else (r, p, y)
+        place = (nan, nan, nan) if empty == "local_position_ned" else tuple(map(float, NED[i]))
+        send(i, mav.MAVLink_attitude_message(ms, *turn, 0.0, 0.0, 0.0))
+        send(i, mav.MAVLink_local_position_ned_message(ms, *place, 0.0, 0.0, 0.0))
+        if empty == "vision_position_estimate":
+            send(i, mav.MAVLink_vision_position_estimate_message(int(US[i]), *[nan] * 6))
         g, a = np.round(GYRO_FRD[i] * 1e3).astype(int), np.round(ACCEL_FRD[i] / 9.80665e-3).astype(int)
         send(i, mav.MAVLink_scaled_imu_message(ms, *map(int, a), *map(int, g), 0, 0, 0))
         if i % 4 == 0:
@@ -516,3 +526,12 @@ def dji(gimbal: tuple[float, float, float], relative: float = 60.0, more: str = 
         f'drone-dji:RelativeAltitude="{relative:+.2f}" drone-dji:GimbalRollDegree="{r:+.2f}" '
         f'drone-dji:GimbalPitchDegree="{p:+.2f}" drone-dji:GimbalYawDegree="{y:+.2f}" {more}/></rdf:RDF></x:xmpmeta>'
     )
+
+
+def shots_of(folder: Path, count: int, every_s: int = 3, **fields: Any) -> Path:
+    """A folder of photos, one every ``every_s`` seconds, on the way north."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        time = f"2024:05:06 10:20:{10 + every_s * i}"
+        photo(folder / f"DJI_{i + 1:04d}.JPG", time=time, lat=LAT0 + i * 1e-4, **fields)
+    return folder

@@ -89,7 +89,7 @@ def _reader(kind: str) -> Reader:
                 f"{path}: quaternion order is given, but this format names its parts: remove 'quaternion'"
             )
         try:
-            log = _READERS[kind](path, LogOptions(options.topic))
+            log = _READERS[kind](path, LogOptions(options.topic, only_odometry=True))
         except MissingInputError as error:
             raise FlightError(str(error)) from None
         if log.odometry is None or not len(log.odometry.t_s):

@@ -152,17 +152,18 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
         attitude = Orientation(euler[:, 0], _from_degrees(euler[:, 1:4]), True, "ATT")
     streams = {name: _core(found[name]) for name in _FILTERS if name in found}
     counts = {name: len(rows) for name, rows in streams.items() if rows}
-    if "VISP" in found:
-        counts = {"VISP": len(found["VISP"])} | counts
+    seen = _rows(
+        found.get("VISP", []),
+        lambda m: [time(m), m.PX, m.PY, m.PZ, m.Roll, m.Pitch, m.Yaw, getattr(m, "Rst", 0)],
+    )
+    if seen.size:
+        counts = {"VISP": len(seen)} | counts
     stream = choose(path, "odometry", "--topic", options.topic, counts, any_topic=True)
     odometry = None
     if stream == "VISP":
-        rows = _rows(
-            found["VISP"], lambda m: [time(m), m.PX, m.PY, m.PZ, m.Roll, m.Pitch, m.Yaw, getattr(m, "Rst", 0)]
-        )
-        segment = rows[:, 7].astype(np.int64)
+        segment = seen[:, 7].astype(np.int64)
         odometry = Odometry(
-            rows[:, 0], enu_from_ned(rows[:, 1:4]), _from_degrees(rows[:, 4:7]), "VISP", segment
+            seen[:, 0], enu_from_ned(seen[:, 1:4]), _from_degrees(seen[:, 4:7]), "VISP", segment
         )
     elif stream is not None:
         rows = _rows(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw])
@@ -301,31 +302,36 @@ def _telemetry(path: Path, options: LogOptions) -> Log:
         return float(stamp) if 0.0 < stamp < 1e8 else float(m._timestamp - start)
 
     attitude = None
-    if "ATTITUDE" in found:
-        rows = _rows(found["ATTITUDE"], lambda m: [time(m), m.roll, m.pitch, m.yaw])
-        wxyz = enu_flu_from_ned_frd(quaternion_from_euler(*rows[:, 1:4].T))
-        attitude = Orientation(rows[:, 0], wxyz, True, "ATTITUDE")
-    elif "ATTITUDE_QUATERNION" in found:
-        rows = _rows(found["ATTITUDE_QUATERNION"], lambda m: [time(m), m.q1, m.q2, m.q3, m.q4])
-        attitude = Orientation(rows[:, 0], enu_flu_from_ned_frd(rows[:, 1:5]), True, "ATTITUDE_QUATERNION")
-    counts: dict[str, int] = {
-        n: len(found[n]) for n in ("VISION_POSITION_ESTIMATE", "LOCAL_POSITION_NED") if n in found
+    euler = _rows(found.get("ATTITUDE", []), lambda m: [time(m), m.roll, m.pitch, m.yaw])
+    quaternions = _rows(found.get("ATTITUDE_QUATERNION", []), lambda m: [time(m), m.q1, m.q2, m.q3, m.q4])
+    if euler.size:
+        wxyz = enu_flu_from_ned_frd(quaternion_from_euler(*euler[:, 1:4].T))
+        attitude = Orientation(euler[:, 0], wxyz, True, "ATTITUDE")
+    elif quaternions.size:
+        wxyz = enu_flu_from_ned_frd(quaternions[:, 1:5])
+        attitude = Orientation(quaternions[:, 0], wxyz, True, "ATTITUDE_QUATERNION")
+    # A filter without a position says NaN: then there is no odometry of it.
+    tracks = {
+        "VISION_POSITION_ESTIMATE": _rows(
+            found.get("VISION_POSITION_ESTIMATE", []),
+            lambda m: [time(m), m.x, m.y, m.z, m.roll, m.pitch, m.yaw, getattr(m, "reset_counter", 0)],
+        ),
+        "LOCAL_POSITION_NED": _rows(
+            found.get("LOCAL_POSITION_NED", []) if attitude is not None else [],
+            lambda m: [time(m), m.x, m.y, m.z],
+        ),
     }
-    if attitude is None:
-        counts.pop("LOCAL_POSITION_NED", None)
+    counts = {name: len(rows) for name, rows in tracks.items() if rows.size}
     stream = choose(path, "odometry", "--topic", options.topic, counts, any_topic=True)
     odometry = None
     if stream == "LOCAL_POSITION_NED":
         assert attitude is not None
-        rows = _rows(found[stream], lambda m: [time(m), m.x, m.y, m.z])
+        rows = tracks[stream]
         odometry = Odometry(
             rows[:, 0], enu_from_ned(rows[:, 1:4]), mixed(attitude.t_s, attitude.wxyz, rows[:, 0]), stream
         )
     elif stream is not None:
-        rows = _rows(
-            found[stream],
-            lambda m: [time(m), m.x, m.y, m.z, m.roll, m.pitch, m.yaw, getattr(m, "reset_counter", 0)],
-        )
+        rows = tracks[stream]
         wxyz = enu_flu_from_ned_frd(quaternion_from_euler(*rows[:, 4:7].T))
         odometry = Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream, rows[:, 7].astype(np.int64))
     imu = None
@@ -335,15 +341,18 @@ def _telemetry(path: Path, options: LogOptions) -> Log:
             (1.0, 1.0) if name == "HIGHRES_IMU" else (1e-3, _G * 1e-3)
         )  # milliradians, thousandths of g
         rows = _rows(found[name], lambda m: [time(m), m.xgyro, m.ygyro, m.zgyro, m.xacc, m.yacc, m.zacc])
-        imu = Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]) * gyro, flu_from_frd(rows[:, 4:7]) * accel)
+        if rows.size:
+            imu = Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]) * gyro, flu_from_frd(rows[:, 4:7]) * accel)
     height = None
-    down = [m for m in found.get("DISTANCE_SENSOR", []) if m.orientation == 25]
-    if down:
-        rows = _rows(down, lambda m: [time(m), m.current_distance / 100.0])
-        height = Height(rows[:, 0], rows[:, 1], "ground", "DISTANCE_SENSOR")
-    elif any(m.distance > 0.0 for m in found.get("RANGEFINDER", [])):
-        rows = _rows(found["RANGEFINDER"], lambda m: [time(m), m.distance])
-        height = Height(rows[:, 0], rows[:, 1], "ground", "RANGEFINDER")
+    down = _rows(
+        [m for m in found.get("DISTANCE_SENSOR", []) if m.orientation == 25],
+        lambda m: [time(m), m.current_distance / 100.0],
+    )
+    ranges = _rows(found.get("RANGEFINDER", []), lambda m: [time(m), m.distance])
+    if down.size:
+        height = Height(down[:, 0], down[:, 1], "ground", "DISTANCE_SENSOR")
+    elif ranges.size and (ranges[:, 1] > 0.0).any():
+        height = Height(ranges[:, 0], ranges[:, 1], "ground", "RANGEFINDER")
     elif odometry is not None:
         height = Height(odometry.t_s, odometry.xyz_m[:, 2], "take-off", odometry.source)
     gnss = None

@@ -410,7 +410,9 @@ def _lists(folder: Path, photos: list[_Photo], notes: list[str]) -> None:
 
 
 def _mrk(path: Path, photos: list[_Photo], notes: list[str]) -> None:
-    # number, seconds of the GPS week, [week], offsets N E V in mm, Lat, Lon, Ellh, sigmas N, E, V in m, quality
+    # number, seconds of the GPS week, [week], offsets N E V in mm, Lat, Lon, Ellh, sigmas N, E, V in m, quality.
+    # The places are of the camera already: the offsets from the antenna are in them (DJI Zenmuse P1 User Manual,
+    # "Image Log File": "longitude", "latitude after compensation"); only a track of one's own antenna needs them.
     rows: dict[int, list[float]] = {}
     for line, text in enumerate(path.read_bytes().decode("utf-8", "replace").splitlines(), start=1):
         if not text.strip():
@@ -428,9 +430,7 @@ def _mrk(path: Path, photos: list[_Photo], notes: list[str]) -> None:
         row = rows.get(sorted(rows)[i] if by_order else keys[i])
         if row is None:
             continue
-        _, tow, week, north, east, _, lat, lon, alt, sn, se, _ = row[:12]
-        photo.lat = lat + north / 1000.0 / 111_320.0
-        photo.lon = lon + east / 1000.0 / (111_320.0 * max(math.cos(math.radians(lat)), 1e-6))
+        _, tow, week, _, _, _, photo.lat, photo.lon, alt, sn, se, _ = row[:12]
         photo.alt, photo.sigma = alt, max(sn, se)
         photo.t_s = 315_964_800.0 + week * 604_800.0 + tow
         matched += 1

@@ -160,6 +160,7 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
     damaged bags, stamps that jump back, empty quaternions; MissingInputError without the package rosbags.
     """
     options = options or LogOptions()
+    more = not options.only_odometry
     notes: list[str] = []
     with _open(path) as reader:
         poses, links = _odometry_counts(reader)
@@ -180,20 +181,19 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
             "pictures",
             "--image-topic",
             options.image_topic,
-            _counts(reader, _IMAGES),
+            _counts(reader, _IMAGES) if more else {},
             options.any_topic,
         )
-        imu_topic = choose(
-            path, "inertial readings", "--imu-topic", options.imu_topic, _counts(reader, (_IMU,)), True
-        )
-        imus = _counts(reader, (_IMU,))
+        imus = _counts(reader, (_IMU,)) if more else {}
+        imu_topic = choose(path, "inertial readings", "--imu-topic", options.imu_topic, imus, True)
         if len(imus) > 1 and options.imu_topic is None:
             notes.append(
                 f"{imu_topic} is taken of {len(imus)} inertial streams: {', '.join(imus)} (--imu-topic)"
             )
-        fix_topic = next(iter(sorted(_counts(reader, (_FIX,)).items(), key=lambda kv: -kv[1])), (None,))[0]
-        range_topic = next(iter(_counts(reader, (_RANGE,))), None)
-        infos = list(_counts(reader, (_INFO,)))
+        fixes = _counts(reader, (_FIX,)) if more else {}
+        fix_topic = max(fixes, key=lambda name: fixes[name], default=None)
+        range_topic = next(iter(_counts(reader, (_RANGE,)) if more else ()), None)
+        infos = list(_counts(reader, (_INFO,)) if more else ())
         info_topic = None
         if image_topic and infos:
             base = image_topic.split("/image")[0]

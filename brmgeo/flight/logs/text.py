@@ -68,7 +68,7 @@ def read_text_log(path: Path, options: LogOptions | None = None) -> Log:
             order = likely
         seen = likely or "cannot be told from these turns"
         notes.append(f"quaternion read as {order or own}; likely order: {seen}")
-    odometry = read_odometry(path, kind, OdometryOptions(order, options.frame_times_s))
+    odometry = read_odometry(path, kind, OdometryOptions(order, options.frame_times_s, own_times=True))
     rows = len([line for line in read_text(path).splitlines() if line.strip() and line.strip()[0] != "#"])
     dropped = rows - len(odometry.t_s) - (kind == "csv")
     if dropped:

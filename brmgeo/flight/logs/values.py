@@ -27,6 +27,7 @@ class LogOptions:
         frame_times_s: (n,) times for KITTI poses.
         format: name of a text format; None finds it out.
         any_topic: take the first candidate where several are (for a look, not for an import).
+        only_odometry: leave out what else a log holds where that costs anything, such as pictures.
     """
 
     topic: str | None = None
@@ -36,6 +37,7 @@ class LogOptions:
     frame_times_s: FloatArray | None = None
     format: str | None = None
     any_topic: bool = False
+    only_odometry: bool = False
 
 
 @dataclass(frozen=True, slots=True)
