@@ -27,6 +27,8 @@ from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
 from brmgeo.region import Region, TrainingSettings, load_region
 from brmgeo.segment import SPLITS, UNKNOWN
+from brmgeo.segment.predict import require_whole
+from brmgeo.segment.samples import blank_unknown
 from brmgeo.segment.shards import (
     FORMAT,
     INDEX_CSV,
@@ -270,14 +272,15 @@ def _survey_some(inputs: Inputs, text: str, todo: tuple[float, int, list[Window]
         coarse = Affine(a.a * COARSE, 0.0, a.c, 0.0, a.e * COARSE, a.f)
         small = GeoBox((window.height // COARSE, window.width // COARSE), coarse, grid.crs)
         rgb, seen = mosaic_to_lattice(_sources(inputs, settings), small)
-        ground = seen & (mask[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] == 0)
-        label = make_label(mask, np.repeat(np.repeat(seen, COARSE, axis=0), COARSE, axis=1))
+        told = seen & (blank_unknown(rgb, np.zeros(seen.shape, np.uint8), 2) != UNKNOWN)
+        ground = told & (mask[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] == 0)
+        label = make_label(mask, np.repeat(np.repeat(told, COARSE, axis=0), COARSE, axis=1))
         built, known = shares(label)
         tile["built"], tile["known"] = round(built, 6), round(known, 6)
         if known < settings["min_known_share"] or known == 0:
-            tile["dropped"] = "unknown"
+            tile["dropped"] = "blank" if seen.any() and not told.any() else "unknown"
         else:
-            tile["dropped"] = picture_fault(rgb, seen, ground, settings["max_cloud_share"])
+            tile["dropped"] = picture_fault(rgb, told, ground, settings["max_cloud_share"])
         if tile["dropped"] is None and tile["split"] is None:
             tile["dropped"] = "guard"
     return found
@@ -333,7 +336,8 @@ def run_tiles(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
                 window = Window(tile["row"], tile["col"], settings["tile_px"], settings["tile_px"])
                 place = window.box_in(grid)
                 rgb, seen = mosaic_to_lattice(_sources(inputs, settings), grid, window)
-                label = make_label(_mask(inputs, place, settings["align"]), seen)
+                # Filler is no ground, whether its file says so or not.
+                label = blank_unknown(rgb, make_label(_mask(inputs, place, settings["align"]), seen))
                 built, known = shares(label)
                 info = TileInfo(
                     tile["key"],
@@ -409,7 +413,7 @@ def run_index(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         "by_gsd_m": _counted(rows, "gsd_m"),
         "by_split": _counted(rows, "split"),
         "splits": {split: _told(tally) for split, tally in tallies.items() if tally.tiles},
-        # What a network's input is normalised with; from training tiles wherever there are some.
+        # Of training tiles wherever there are some; brmgeo's own network is normalised with constants instead.
         "statistics": {"split": statistics} | _colour_told(tallies[statistics]),
         "survey": facts,
         "alignment": None if offsets is None else {"corrected": settings["align"]} | offsets["region"],
@@ -481,8 +485,8 @@ def _write_gpkg(path: Path, rows: Sequence[Json], credit: str, blocks: Sequence[
 
 
 ALIGNMENT = Stage("alignment", 1, run_alignment)
-SURVEY = Stage("tile-survey", 1, run_survey)
-TILES = Stage("tiles", 1, run_tiles)
+SURVEY = Stage("tile-survey", 2, run_survey)
+TILES = Stage("tiles", 2, run_tiles)
 INDEX = Stage("tile-index", 1, run_index)
 
 
@@ -587,9 +591,11 @@ def plan_tiles(
 
 
 def flights_over(name: str, data: Path) -> list[str]:
-    """Names of the flights, own or simulated, that lie below a region's folders."""
+    """Names of the flights, own or simulated, that lie below a region's folders, an evaluation's among them."""
     found = {p.parent.name for p in (data / "source" / name / "flights").glob("*/flight.toml")}
     found |= {p.name for p in (data / "out" / name / "flights").glob("*") if p.is_dir()}
+    if (data / "out" / name / "evaluation").is_dir():
+        found.add("the simulated flights of brmgeo evaluate")
     return sorted(found)
 
 
@@ -759,6 +765,13 @@ def why_lines(name: str, stage: str, data: Path) -> list[str] | None:
     return None if plan is None or stage not in plan.steps else plan.why(stage)
 
 
+def last_aligned(name: str, data: Path) -> bool:
+    """True where the tiles of a region were aligned when they were last cut."""
+    region, data = region_named(name, data)
+    last = Store(data / "work").latest(region.name, "tile-index")
+    return bool(last is not None and last["settings"]["align"])
+
+
 def _plan_as_last_cut(name: str, data: Path) -> Plan | None:
     """The steps of a region's tiles, aligned or not as they were last cut; None when they never were."""
     region, data = region_named(name, data)
@@ -776,14 +789,7 @@ def run_pairs(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     dropped: Counter[str] = Counter()
     with ShardWriter(out / "shard.tar", image_format="png") as shard:
         for key, image_name, mask_name in settings["pairs"]:
-            image, seen = _read_image(inputs["images"] / image_name)
-            label = check_label(_read_mask(inputs["masks"] / mask_name), mask_name)
-            if label.shape != seen.shape:
-                raise InputError(
-                    f"{inputs['masks'] / mask_name}: {label.shape[1]} x {label.shape[0]} px, its image {image_name} has "
-                    f"{seen.shape[1]} x {seen.shape[0]}; give masks of their images' sizes"
-                )
-            label[~seen] = UNKNOWN
+            image, label = read_pair(inputs["images"] / image_name, inputs["masks"] / mask_name)
             built, known = shares(label)
             fault = "unknown" if known == 0 else picture_fault(image, label != UNKNOWN)
             if fault is not None:
@@ -805,6 +811,22 @@ def run_pairs(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
             tallies[settings["split"]].add(image, label)
     _write_entries(out, [entry_row(entry) for entry in shard.entries], tallies)
     return {"tiles": len(shard.entries), "dropped": dict(sorted(dropped.items()))}
+
+
+def read_pair(image_path: Path, mask_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """(h, w, 3) uint8 RGB and (h, w) uint8 label of a picture and its mask; unknown where transparent or plain filler.
+
+    Raises InputError for files that are damaged, cut short, of more than 8 bits, of odd values or of different sizes.
+    """
+    image, seen = _read_image(image_path)
+    label = check_label(_read_mask(mask_path), mask_path.name)
+    if label.shape != seen.shape:
+        raise InputError(
+            f"{mask_path}: {label.shape[1]} x {label.shape[0]} px, its image {image_path.name} has "
+            f"{seen.shape[1]} x {seen.shape[0]}; give masks of their images' sizes"
+        )
+    label[~seen] = UNKNOWN
+    return image, blank_unknown(image, label)
 
 
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -832,6 +854,8 @@ def _decoded(path: Path) -> NDArray[np.uint8]:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if data.size:
+        require_whole(path, data.tobytes())
     found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if found is None:
         raise InputError(
@@ -847,7 +871,7 @@ def _decoded(path: Path) -> NDArray[np.uint8]:
     return np.asarray(found, dtype=np.uint8)
 
 
-PAIRS = Stage("tile-pairs", 1, run_pairs)
+PAIRS = Stage("tile-pairs", 2, run_pairs)
 
 
 def cut_pairs(
@@ -924,6 +948,13 @@ def _paired(images: Path, masks: Path) -> list[tuple[str, str, str]]:
         files = [
             p for p in sorted(folder.iterdir()) if p.suffix.lower() in PICTURES and not p.name.startswith(".")
         ]
+        own = Counter(p.stem for p in files)
+        double = sorted(stem for stem, count in own.items() if count > 1)
+        if double:
+            raise InputError(
+                f"tiles --pairs: {folder} holds several pictures named {double[0]} that differ in their ending only; "
+                "leave one of them"
+            )
         found.append({p.stem: p.name for p in files})
     pictures, labels = found
     if not pictures:

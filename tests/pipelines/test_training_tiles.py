@@ -215,6 +215,11 @@ def test_held_out_and_flown_regions_are_for_testing_only(
     flight = region.data / "source" / "small" / "flights" / "north"
     flight.mkdir(parents=True)
     (flight / "flight.toml").write_text('name = "north"\n')
+    evaluated = region.out / "evaluation"
+    evaluated.mkdir()
+    with pytest.raises(Exception, match="flown over by north and the simulated flights of brmgeo evaluate"):
+        require_trainable(load_region(region.toml), region.data)
+    evaluated.rmdir()
     assert "flown over by north" in cut(capsys, region).error
     with pytest.raises(Exception, match="flown over by north"):
         require_trainable(load_region(region.toml), region.data)
@@ -229,8 +234,10 @@ def test_held_out_and_flown_regions_are_for_testing_only(
     assert "never trained on" in cut(capsys, region).error
 
 
-def test_real_ground_that_is_held_out_is_kept_out_of_neighbours(tiled: SmallRegion, tmp_path: Path) -> None:
-    region = tiled.copied_to(tmp_path / "data", store=False)
+def test_real_ground_that_is_held_out_is_kept_out_of_neighbours(
+    tiled: SmallRegion, tmp_path: Path, capsys: Capture
+) -> None:
+    region = tiled.copied_to(tmp_path / "data")
     _, bottom, right, top = BOUNDS
     own = load_region(region.toml)
     assert held_ground(own, region.data) == []
@@ -244,6 +251,10 @@ def test_real_ground_that_is_held_out_is_kept_out_of_neighbours(tiled: SmallRegi
     assert held[0][1][0] == pytest.approx(right - 60 - 12)
     plan, _ = plan_tiles(own, Store(tmp_path / "work"), region.data)
     assert plan.steps["tile-survey"].settings["held"][0][0] == "other"
+    assert cut(capsys, region, "--gsd", "1.7", "--split", "train").status == 0
+    tiles = tiles_of(region)
+    assert tiles.facts["survey"]["dropped"]["held-out ground"] > 0
+    assert max(info.bounds[2] for info in tiles.infos) <= right - 60 - 12
 
 
 def test_gsds_much_finer_than_the_imagery_are_left_out(
@@ -275,6 +286,26 @@ def test_blank_and_missing_imagery_is_dropped_and_counted(
     for path in pictures[:-1]:
         cv2.imwrite(str(path), blank)
     assert "no tile is left" in cut(capsys, region).error
+
+
+def test_filler_is_no_ground(tiled: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
+    """Imagery filled up with black or white where it ends says nothing of the ground there."""
+    region = tiled.copied_to(tmp_path / "data", store=False)
+    for path in region.tiles.rglob("*.png"):
+        picture = cv2.imread(str(path))
+        picture[:, :128] = 0
+        picture[:, 192:] = 255
+        cv2.imwrite(str(path), picture)
+    assert cut(capsys, region, "--gsd", "0.8", "--split", "train").status == 0
+    tiles = tiles_of(region)
+    filled = 0
+    for i in range(len(tiles)):
+        image, label = tiles.read(i)
+        plain = (image == 0).all(-1) | (image == 255).all(-1)
+        inner = cv2.erode(plain.astype(np.uint8), np.ones((15, 15))) > 0
+        assert (label[inner] == UNKNOWN).all()
+        filled += int(inner.sum())
+    assert filled > 1000
 
 
 def test_options_are_refused_in_one_line(tiled: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
@@ -419,7 +450,10 @@ def test_names_that_a_key_cannot_tell_apart_get_numbers(pairs: tuple[Path, Path]
         ("coloured mask", "one band"),
         ("other size", "64 x 40 px, its image"),
         ("16 bit", "holds uint16 values"),
-        ("damaged", "is not a readable picture"),
+        ("damaged", "damaged or cut short"),
+        ("no picture", "is not a readable picture"),
+        ("cut short", "damaged or cut short"),
+        ("same name", "several pictures named p 3"),
         ("tiny", "training tiles have 32 to 8192 px"),
     ],
 )
@@ -446,6 +480,14 @@ def test_bad_pairs_are_refused_in_one_line(
         cv2.imwrite(str(images / "p 3.png"), np.zeros((48, 64, 3), np.uint16))
     elif fault == "damaged":
         (images / "p 3.png").write_bytes((images / "p 3.png").read_bytes()[:60])
+    elif fault == "no picture":
+        (images / "p 3.png").write_bytes(b"no picture")
+    elif fault == "cut short":
+        whole = cv2.imencode(".jpg", cv2.imread(str(images / "p 3.png")))[1].tobytes()
+        (images / "p 3.png").unlink()
+        (images / "p 3.jpg").write_bytes(whole[: len(whole) // 2])
+    elif fault == "same name":
+        shutil.copy(images / "p 3.png", images / "p 3.jpg")
     elif fault == "tiny":
         for folder in pairs:
             cv2.imwrite(str(folder / "p 3.png"), mask[:20, :20])
