@@ -125,7 +125,9 @@ class _Dask:
 
     def close(self) -> None:
         self._client = None
-        self._stack.close()
+        # All work is done by now: a busy machine's workers that are slow to say goodbye must not make it fail.
+        with contextlib.suppress(TimeoutError):
+            self._stack.close()
 
     def _start(self) -> Any:
         if self._client is None:

@@ -292,3 +292,20 @@ def test_workers_with_another_brmgeo_or_disk_are_refused(
         scheduler(address, shared=tmp_path) as map,
     ):
         list(map(toys.square, range(3)))
+
+
+def test_workers_that_are_slow_to_leave_do_not_fail_finished_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    import brmgeo.workflow.schedule as schedule
+
+    dask = schedule._Dask(None, tmp_path, None, lambda line: None)
+
+    def slow() -> None:
+        raise TimeoutError
+
+    dask._stack.callback(slow)
+    left = []
+    dask._stack.callback(left.append, "the others")
+    dask.close()
+    assert left == ["the others"]
