@@ -6,7 +6,9 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import time
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import FlightError, InputError
-from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.folder import MADE_BY, Flight, is_own_odometry, read_flight
 from brmgeo.flight.planar import run_planar
 from brmgeo.flight.readings import Imu, Odometry
-from brmgeo.flight.vio import VioSettings, run_vio
+from brmgeo.flight.vio import GyroInDegreesError, VioSettings, run_vio
 
 FloatArray = NDArray[np.float64]
 Method = Literal["auto", "vio", "planar"]
-MADE_BY = "brmgeo odometry"
 MADE_FROM_FRAMES = "made from the frames"
 #: Slower than this, frames do not overlap enough in time for points to be followed between them.
 VIDEO_INTERVAL_S = 0.6
@@ -45,6 +46,10 @@ class Embedded:
 
 def checked_imu(imu: Imu, path: Path, times_s: FloatArray) -> Imu:
     """The IMU as it is; FlightError when its units, axes or times cannot be right."""
+    if len(imu.t_s) < 2:
+        raise FlightError(
+            f"{path}: {len(imu.t_s)} reading: odometry needs a hundred or so a second of the whole flight"
+        )
     first, last = float(imu.t_s[0]), float(imu.t_s[-1])
     if last < times_s[-1] - 1.0 or first > times_s[0] + 1.0:
         raise FlightError(
@@ -114,7 +119,12 @@ def estimate(flight: Flight, method: Method = "auto") -> Embedded:
         if imu is None:
             raise FlightError(f"{flight.folder / 'imu.csv'} is missing: add it, or use --method planar")
         imu = checked_imu(imu, flight.folder / "imu.csv", times)
-        result = run_vio(times, pictures(), agl, imu, flight.camera, flight.mount, VioSettings())
+        try:
+            result = run_vio(times, pictures(), agl, imu, flight.camera, flight.mount, VioSettings())
+        except GyroInDegreesError as error:
+            raise FlightError(
+                f"{flight.folder / 'imu.csv'}: {error}: multiply gx, gy, gz by pi / 180"
+            ) from None
         made = Embedded(
             replace(result.odometry, walk_m2=result.walk_m2),
             result.yaw_sigma_rad,
@@ -199,6 +209,7 @@ def own_odometry(flight: Flight, every_s: float) -> OwnOdometry:
         f"{MADE_FROM_FRAMES}: {made.odometry.source}, {facts['length_m']:.0f} m in {facts['seconds']:.0f} s, "
         f"{facts['blind_frames']} of {facts['poses']} poses blind, {facts['segments']} segment(s)"
     )
+    says = "; ".join([says, *facts["warnings"]])
     kept = thinned_rows(flight.times_s, every_s) if dense else np.arange(len(flight.frames))
     if len(kept) < len(flight.frames):
         says += f"; every {every_s:g} s one of its {len(flight.frames)} frames is matched"
@@ -212,7 +223,7 @@ def odometry_name(flight: Flight, source: str) -> str:
         return "none"
     if flight.odometry.source.startswith(MADE_FROM_FRAMES):
         return flight.odometry.source
-    if _is_ours(flight.folder / "odometry.json"):
+    if is_own_odometry(flight.folder):
         method = json.loads((flight.folder / "odometry.json").read_text(encoding="utf-8"))["method"]
         return f"{MADE_FROM_FRAMES} by {MADE_BY}: {method}"
     return f"{source}: {flight.odometry.source or 'odometry'}"
@@ -249,23 +260,24 @@ def make_odometry(flight_dir: Path, method: Method = "auto") -> dict[str, Any]:
 
     ``odometry.tum`` (poses), ``odometry.covariance.csv`` (what they are worth), ``odometry.json`` (facts); flight.toml gets
     an [odometry] section, so that localize reads them. A flight that came with odometry of its own keeps it: then the
-    names begin with ``embedded`` and flight.toml stays as it is.
+    names begin with ``embedded`` and flight.toml stays as it is. A run that is killed leaves a folder that the next one
+    mends: the facts come first and tell whose the files are, flight.toml last.
     """
     toml = flight_dir / "flight.toml"
-    flight = read_flight(flight_dir)
-    ours = _is_ours(flight_dir / "odometry.json")
-    stem = "odometry" if flight.odometry is None or ours else "embedded"
+    ours = is_own_odometry(flight_dir)
+    flight = read_flight(flight_dir, with_odometry=not ours)
+    stem = "odometry" if flight.odometry is None else "embedded"
     made = estimate(flight, method)
-    write_track(flight_dir, stem, made)
     facts = made.facts | {"track": f"{stem}.tum", "covariance": f"{stem}.covariance.csv"}
-    if flight.odometry is None:
-        text = toml.read_text(encoding="utf-8")
+    _replace(flight_dir / f"{stem}.json", json.dumps(facts, indent=1) + "\n")
+    write_track(flight_dir, stem, made)
+    text = toml.read_text(encoding="utf-8-sig")
+    if "odometry" not in tomllib.loads(text):
         section = (
             f'[odometry]  # made by `{MADE_BY}`\nfile = "{stem}.tum"\nformat = "tum"\n'
             f'covariance = "{stem}.covariance.csv"\n'
         )
         _replace(toml, text.rstrip("\n") + "\n" + section)
-    _replace(flight_dir / f"{stem}.json", json.dumps(facts, indent=1) + "\n")
     return facts
 
 
@@ -289,7 +301,7 @@ def thin_flight(flight_dir: Path, out: Path, every_s: float) -> Path:
     """A flight folder with a frame every ``every_s`` seconds and the whole odometry: what a matcher wants of a video.
 
     Pictures and masks are copied as they are. Raises InputError for a video flight, whose frames are no files, for an
-    interval that is not positive, and for a folder that holds something already.
+    interval that is not positive, and for a folder that holds something already. ``out`` comes into being whole, or not.
     """
     if not every_s > 0:
         raise InputError(f"--every {every_s}: give seconds, more than 0")
@@ -302,18 +314,24 @@ def thin_flight(flight_dir: Path, out: Path, every_s: float) -> Path:
     lines = (flight_dir / "frames.csv").read_text(encoding="utf-8-sig").splitlines()
     rows = [i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     chosen = [lines[rows[0]], *(lines[rows[1 + int(i)]] for i in kept)]
-    out.mkdir(parents=True, exist_ok=True)
-    for path in sorted(flight_dir.iterdir()):
-        if path.is_file() and path.name != "frames.csv" and not path.name.startswith("."):
-            shutil.copy2(path, out / path.name)
-    for folder, wanted in (("frames", flight.has_images), ("masks", flight.has_masks)):
-        for i in kept if wanted else []:
-            name = flight.frames[int(i)].file
-            source = Path(name) if folder == "frames" else Path(name).with_suffix(".png")
-            (out / folder / source).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(flight_dir / folder / source, out / folder / source)
-    _replace(out / "frames.csv", "\n".join(chosen) + "\n")
-    read_flight(out)
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.absolute().parent) as scratch:
+        work = Path(scratch) / out.name
+        work.mkdir()
+        for path in sorted(flight_dir.iterdir()):
+            if path.is_file() and path.name != "frames.csv" and not path.name.startswith("."):
+                shutil.copy2(path, work / path.name)
+        for folder, wanted in (("frames", flight.has_images), ("masks", flight.has_masks)):
+            for i in kept if wanted else []:
+                name = flight.frames[int(i)].file
+                source = Path(name) if folder == "frames" else Path(name).with_suffix(".png")
+                (work / folder / source).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(flight_dir / folder / source, work / folder / source)
+        _replace(work / "frames.csv", "\n".join(chosen) + "\n")
+        read_flight(work)
+        if out.is_dir():
+            out.rmdir()
+        work.rename(out)
     return out
 
 
@@ -321,13 +339,6 @@ def thinned_rows(times_s: FloatArray, every_s: float) -> NDArray[np.int64]:
     """(k,) indices of the first frame in each ``every_s`` seconds."""
     slot = np.floor((times_s - times_s[0]) / every_s + 1e-6)
     return np.flatnonzero(np.diff(slot, prepend=-1.0) > 0).astype(np.int64)
-
-
-def _is_ours(path: Path) -> bool:
-    try:
-        return bool(json.loads(path.read_text(encoding="utf-8")).get("made_by") == MADE_BY)
-    except (OSError, ValueError, AttributeError):
-        return False
 
 
 def _replace(path: Path, text: str) -> None:

@@ -685,7 +685,8 @@ def run_vio(
         imu: readings in the body frame over the whole time.
         camera, mount: the camera and how it sits in the body.
 
-    Raises ValueError when there are fewer than two frames or IMU readings.
+    Raises ValueError when there are fewer than two frames or IMU readings, GyroInDegreesError where the first pictures
+    tell that the gyro is not in radians.
     """
     times = np.asarray(times_s, dtype=np.float64)
     if len(times) < 2 or len(imu.t_s) < 2:
@@ -739,6 +740,10 @@ def _even(
     return np.asarray(np.interp(times, times[at], np.maximum.accumulate(walk[at])))
 
 
+class GyroInDegreesError(ValueError):
+    """The gyro tells the turns that the pictures show, about 57 times over."""
+
+
 def coarse_delay(
     times_s: FloatArray, images: Sequence[NDArray[np.uint8]], imu: Imu, camera: Camera, mount: Attitude
 ) -> float:
@@ -751,6 +756,8 @@ def coarse_delay(
     Args:
         times_s: (n,) of the pictures; images: n grey (h, w) uint8.
         camera, mount, imu: as for ``run_vio``.
+
+    Raises GyroInDegreesError where the shifts by the gyro are those of the pictures, but some 57 times as large.
     """
     n = len(images)
     if n < 30 or times_s[n - 1] - times_s[0] < 6.0:
@@ -771,13 +778,18 @@ def coarse_delay(
     )
     turned = turned @ mount.body_from_camera()
     delays = np.arange(-MAX_DELAY_S, MAX_DELAY_S + 0.01, 0.02)
-    fits = np.empty(len(delays))
+    fits, scales = np.empty(len(delays)), np.empty(len(delays))
     for k, delay in enumerate(delays):
         at = np.stack([np.interp(times_s[:n] + delay, imu.t_s, turned[:, c]) for c in range(3)], axis=-1)
         step = np.diff(at, axis=0)
         told = _without_slow(np.stack([-camera.fx * step[:, 1], camera.fy * step[:, 0]], axis=-1), half)
         fits[k] = (seen * told).sum() / max(float(np.sqrt((told**2).sum() * (seen**2).sum())), 1e-9)
+        scales[k] = (told**2).sum() / max(float((seen * told).sum()), 1e-9)
     best, none = int(fits.argmax()), int(np.abs(delays).argmin())
+    if fits[best] > 0.5 and 20.0 < scales[best] < 170.0:
+        raise GyroInDegreesError(
+            f"the gyro turns {scales[best]:.0f} times as fast as the pictures: it is in degrees"
+        )
     sure = fits[best] > 0.5 and fits[best] > fits[none] + 0.1
     return float(delays[best]) if sure else 0.0
 

@@ -6,11 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import click
+import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from PIL import ExifTags, Image
 
+from brmgeo.errors import FlightError
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.readings import Odometry
+from brmgeo.geo.crs import transformer
+from pipelines import cli, odometry
 from pipelines.flights import motions_of
 
 TOML = """name = "small"
@@ -26,7 +33,6 @@ source = "frames"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A flight folder of four frames, without odometry."""
-    cv2 = pytest.importorskip("cv2")
     root = tmp_path / "flight"
     (root / "frames").mkdir(parents=True)
     for i in range(4):
@@ -52,3 +58,201 @@ def test_a_fast_aircraft_is_no_reset_where_its_speed_is_allowed(folder: Path) ->
     slow = replace(cast(Flight, flight), odometry=track(30.0))
     # A low bound is of movement without odometry: the track itself is believed up to what aircraft fly.
     assert all(m.step_m is not None for m in motions_of(slow, None, 8.0)[1:])
+
+
+def command(*arguments: object) -> tuple[int, str]:
+    """Exit status and what was printed, as the command ``brmgeo`` would have it."""
+    status = -1
+
+    def whole() -> None:
+        nonlocal status
+        status = cli.run(lambda: cli.cli([str(a) for a in arguments], standalone_mode=False))
+
+    result = CliRunner().invoke(click.Command("brmgeo", callback=whole))
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return status, result.output
+
+
+def poses(path: Path, topic: float = 1.0) -> Path:
+    rows = [f"{100 + i / 10} {topic * i} 0 1 0 0 0 1" for i in range(200)]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_no_frames_a_second_is_no_rate(tmp_path: Path) -> None:
+    for rate in ("0", "-1"):
+        status, said = command("import", poses(tmp_path / "a.tum"), "--rate", rate, "--out", tmp_path / "out")
+        assert (status, said.count("\n")) == (2, 1)
+        assert "--rate" in said
+
+
+def test_a_place_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+    log = poses(tmp_path / "a.tum")
+    for out in (log / "sub", log / "sub" / "deep", tmp_path / ("n" * 300)):
+        status, said = command("import", log, "--out", out)
+        assert (status, said.count("\n")) == (2, 1), said
+        assert "Traceback" not in said
+        assert str(log if out.parent != tmp_path else out) in said
+    status, said = command("inspect", log, "--write", tmp_path)
+    assert (status, said.count("\n")) == (2, 1)
+
+
+def test_inspect_writes_what_it_tells(tmp_path: Path) -> None:
+    kitti = tmp_path / "poses.txt"
+    kitti.write_text("".join(f"1 0 0 {i} 0 1 0 0 0 0 1 0\n" for i in range(30)))
+    times = tmp_path / "times.txt"
+    times.write_text("".join(f"{i / 10}\n" for i in range(30)))
+    out = tmp_path / "logs.md"
+    words = ("inspect", kitti, "--times", times)
+    status, told = command(*words)
+    assert status == 0
+    assert command(*words, "--write", out) == (0, f"wrote {out}\n")
+    assert told.strip() in out.read_text()
+    assert ".." not in out.read_text().split("## ")[0].replace("...", "")
+    # What cannot be read is told in the file, and by the exit status.
+    assert command("inspect", kitti, "--write", out)[0] == 2
+    assert "## Not read" in out.read_text()
+
+
+def test_inspect_says_where_a_flight_was(folder: Path) -> None:
+    assert "nothing here says where it was flown" in command("inspect", folder)[1]
+    rows = [f"{i},{129.35 + i * 1e-5},36.02,1.5" for i in range(4)]
+    (folder / "reference.csv").write_text("\n".join(["t_s,lon,lat,sigma_m", *rows]) + "\n")
+    status, said = command("inspect", folder)
+    assert status == 0
+    assert "about 36.02000 N 129.35001 E, accuracy 1.50 m" in said or "129.35002 E" in said
+    # Metres of a map tell the same place.
+    (folder / "flight.toml").write_text(TOML + '[reference]\nfile = "reference.csv"\ncrs = "EPSG:5187"\n')
+    x, y = transformer("EPSG:4326", "EPSG:5187").transform(129.35, 36.02)
+    rows = [f"{i},{x},{y}" for i in range(4)]
+    (folder / "reference.csv").write_text("\n".join(["t_s,x,y", *rows]) + "\n")
+    assert "about 36.02000 N 129.35000 E" in command("inspect", folder)[1]
+
+
+def test_import_says_what_it_leaves_out(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i in range(3):
+        image = Image.fromarray(np.full((60, 80, 3), 50 * i, np.uint8))
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[36867] = f"2024:05:06 10:20:{10 + 3 * i}"
+        xmp = (
+            '<x:xmpmeta><x drone-dji:RelativeAltitude="+60.0" drone-dji:GimbalRollDegree="0" '
+            'drone-dji:GimbalPitchDegree="-90" drone-dji:GimbalYawDegree="10"/></x:xmpmeta>'
+        )
+        image.save(photos / f"a{i}.jpg", exif=exif, xmp=xmp.encode())
+    status, said = command("import", photos, "--fov", 43, "--mount", "1,2,3", "--out", tmp_path / "flight")
+    assert status == 0, said
+    assert "--mount was left out" in said
+    assert "no photo has a place in its tags" in said
+    assert read_flight(tmp_path / "flight").mount.roll_rad == 0.0
+
+    video = tmp_path / "flight.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 2.0, (64, 48))
+    for i in range(10):
+        writer.write(np.full((48, 64, 3), 20 * i, np.uint8))
+    writer.release()
+    words = (
+        "import",
+        poses(tmp_path / "a.tum"),
+        "--video",
+        video,
+        "--video-start",
+        101,
+        "--fov",
+        43,
+        "--agl",
+        60,
+    )
+    status, said = command(*words, "--shift-frames", 2, "--out", tmp_path / "filmed")
+    assert status == 0, said
+    assert "--shift-frames was left out" in said
+    assert read_flight(tmp_path / "filmed").times_s[0] == 101.0
+
+
+# ---------------------------------------------------------------- odometry of the flight's own
+
+
+def made(flight: Flight, method: str = "auto") -> odometry.Embedded:
+    """What the filter might have made of a flight."""
+    n = len(flight.frames)
+    facts = {
+        "made_by": "brmgeo odometry", "method": "vio", "length_m": 30.0, "seconds": 3.0, "blind_frames": 0, "poses": n,
+        "segments": 1, "warnings": ["the camera's times differ from the IMU's by +80 ms"],
+    }  # fmt: skip
+    t = flight.times_s
+    track = Odometry(t, np.stack([10.0 * t, 0 * t, 0 * t], -1), np.tile([1.0, 0, 0, 0], (n, 1)), "embedded")
+    track = replace(track, walk_m2=0.01 * t)
+    return odometry.Embedded(track, 0 * t, np.ones(n, np.int64), np.zeros(n, np.bool_), facts)
+
+
+def test_a_killed_run_is_mended_by_the_next(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(odometry, "estimate", made)
+    replaced = odometry._replace
+    before = (folder / "flight.toml").read_text()
+    for again in (False, True):  # a first run, and one over a track that is there
+        for killed in range(4):
+            left = killed
+
+            def replace_some(path: Path, text: str) -> None:
+                nonlocal left
+                if not left:
+                    raise KeyboardInterrupt
+                left -= 1
+                replaced(path, text)
+
+            if again:
+                odometry.make_odometry(folder)
+                (folder / "odometry.tum").write_text("0 0 0 0 0 0 0 1\n")  # of another number of poses
+            else:
+                for path in folder.glob("odometry.*"):
+                    path.unlink()
+                (folder / "flight.toml").write_text(before)
+            with monkeypatch.context() as context:
+                context.setattr(odometry, "_replace", replace_some)
+                if not (again and killed == 3):  # flight.toml is not written again
+                    with pytest.raises(KeyboardInterrupt):
+                        odometry.make_odometry(folder)
+            if not again:
+                assert read_flight(folder).odometry is None
+            odometry.make_odometry(folder)
+            found = read_flight(folder).odometry
+            assert found is not None
+            assert found.walk_m2 == pytest.approx([0.0, 0.01, 0.02, 0.03])
+            assert (folder / "flight.toml").read_text().count("[odometry]") == 1
+
+
+def test_what_the_filter_found_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(odometry, "estimate", made)
+    (folder / "imu.csv").write_text("t_s,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n")
+    flight = read_flight(folder)
+    flight = replace(flight, frames=tuple(replace(f, t_s=f.t_s / 2) for f in flight.frames))
+    assert "differ from the IMU's by +80 ms" in odometry.own_odometry(flight, 5.0).says
+
+
+def test_one_reading_is_no_imu(folder: Path) -> None:
+    (folder / "imu.csv").write_text("t_s,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n")
+    flight = read_flight(folder)
+    imu = flight.imu()
+    assert imu is not None
+    with pytest.raises(FlightError, match=r"imu\.csv: 1 reading"):
+        odometry.checked_imu(imu, folder / "imu.csv", flight.times_s)
+
+
+def test_a_thinned_flight_is_there_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = folder.parent / "thin"
+
+    def full(source: object, target: object) -> None:
+        if str(target).endswith("f2.png"):
+            raise OSError(28, "No space left on device", str(target))
+        copy2(source, target)  # type: ignore[call-overload]
+
+    copy2 = odometry.shutil.copy2
+    with monkeypatch.context() as context:
+        context.setattr(odometry.shutil, "copy2", full)
+        with pytest.raises(OSError, match="No space"):
+            odometry.thin_flight(folder, out, 2.0)
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["flight"]
+    odometry.thin_flight(folder, out, 2.0)
+    assert [f.t_s for f in read_flight(out).frames] == [0.0, 2.0]
+    assert out.stat().st_mode & 0o777 == folder.stat().st_mode & 0o777
