@@ -9,7 +9,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from brmgeo.evaluate.figures import (
     shrinking_figure,
 )
 from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, render_report, verdict
-from brmgeo.evaluate.scores import Scores, dead_reckoning, score
+from brmgeo.evaluate.scores import Scores, dead_reckoning, score, travelled_m
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
 from brmgeo.export.cog import box_of, read_overview, read_window
 from brmgeo.flight.folder import Flight, read_flight
@@ -49,7 +49,6 @@ from brmgeo.match import (
     make_matcher,
 )
 from brmgeo.region import FlightSettings, Region
-from brmgeo.segment.predict import SHIPPED
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
 from pipelines.maps import NativeImagery, native_imagery
@@ -68,7 +67,6 @@ from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named, town_style
 
 FloatArray = NDArray[np.float64]
-CANDIDATES_A_FRAME = 20_000
 SIMULATED_NOTE = "# Simulated by brmgeo"
 PATHS = ("rectangle", "lawnmower", "random")
 
@@ -155,19 +153,8 @@ def locate(
         start = time.perf_counter()
         estimate = matcher.step(view, motion)
         seconds.append(time.perf_counter() - start)
-        estimates.append(thinned(estimate))
+        estimates.append(estimate)
     return Located(estimates, matcher.smooth(), np.array(seconds))
-
-
-def thinned(estimate: Estimate) -> Estimate:
-    """The estimate with at most 20 000 of its candidates, evenly drawn; ``candidate_count`` keeps the true number."""
-    n = len(estimate.candidates)
-    if n <= CANDIDATES_A_FRAME:
-        return estimate
-    kept = np.linspace(0, n - 1, CANDIDATES_A_FRAME).round().astype(np.int64)
-    return replace(
-        estimate, candidates=estimate.candidates[kept], candidate_mass=estimate.candidate_mass[kept]
-    )
 
 
 def view_at(flight: Flight, gsd_m: float, index: int, masks: FrameMasks | None = None) -> View:
@@ -209,10 +196,18 @@ def localize(
     """
     if method not in METHODS:
         raise SettingsError(f"METHOD {method!r} is not known: choose one of {', '.join(METHODS)}")
-    _may_replace(out, "fixes.csv", "results of localize")
+    _may_replace_results(out)
     progress = Progress()
     maps = read_maps(maps_dir.absolute())
     flight = read_flight(flight_dir)
+    if sift and maps.imagery is None:
+        raise MissingInputError(
+            f"{maps.folder / 'imagery.tif'} is not there; --sift matches frames to imagery: leave it out"
+        )
+    if sift and not flight.has_images:
+        raise InputError(
+            f"{flight_dir / 'frames'}: --sift is given, but the flight has masks only; leave it out"
+        )
     if odometry == "auto":
         tried = own_odometry(flight, (flight_settings or FlightSettings()).interval_s)
         flight = tried.flight
@@ -269,16 +264,47 @@ def motions_of(
 
 
 def _source_of(flight: Flight) -> str:
-    text = (flight.folder / "flight.toml").read_text(encoding="utf-8-sig")
+    return _source(flight.folder)
+
+
+def _source(folder: Path) -> str:
+    text = (folder / "flight.toml").read_text(encoding="utf-8-sig", errors="replace")
     return "simulated" if text.startswith(SIMULATED_NOTE) else "as given"
 
 
-def _may_replace(out: Path, sign: str, what: str) -> None:
-    """SettingsError when ``out`` holds files that this command did not write: they would be lost."""
-    if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / sign).is_file()):
+RESULTS = frozenset(
+    ("fixes.csv", "metrics.json", "report.html", "trajectory.geojson", "trajectory.tum", "trajectory.json")
+    + ("candidates.geojson", "candidates.qml")
+    + tuple(f"{name}.gpkg{end}" for name in ("candidates", "trajectory") for end in ("", "-wal", "-shm"))
+)
+SIMULATED = frozenset(
+    ("flight.toml", "frames.csv", "frames", "masks", "imu.csv", "altimeter.csv", "reference.csv")
+    + ("odometry.tum", "odometry.csv", "odometry.covariance.csv", "odometry.json", ".recipe.json")
+)
+
+
+def _may_replace_results(out: Path) -> None:
+    """SettingsError when ``out`` holds files that localize did not write: they would be lost."""
+    _may_replace(out, "fixes.csv", "results of localize", lambda p: p.name in RESULTS or ".qgz" in p.suffix)
+
+
+def _may_replace_flight(out: Path) -> None:
+    """SettingsError when ``out`` holds anything but a flight that was simulated: a real one is flown but once."""
+    _may_replace(out, "flight.toml", "a simulated flight", lambda p: p.name in SIMULATED)
+    if (out / "flight.toml").is_file() and _source(out) != "simulated":
         raise SettingsError(
-            f"--out {out}: there are other files than {what}, and the folder is replaced as a whole; "
+            f"--out {out}: there is a flight that brmgeo did not simulate, and it would be lost; "
             "give a new folder or an empty one"
+        )
+
+
+def _may_replace(out: Path, sign: str, what: str, ours: Callable[[Path], bool]) -> None:
+    there = sorted(out.iterdir()) if out.is_dir() else []
+    foreign = [p for p in there if not ours(p)] or ([] if not there or (out / sign).is_file() else there)
+    if foreign or out.is_file():
+        raise SettingsError(
+            f"--out {out}: there are other files than {what} ({(foreign or [out])[0].name}), and the folder is replaced as "
+            "a whole; give a new folder or an empty one"
         )
 
 
@@ -332,12 +358,19 @@ def _write_results(
     estimates, smoothed, times = located.estimates, located.smoothed, flight.times_s
     files = [frame.file for frame in flight.frames]
     known = np.isfinite(smoothed.xy).all(axis=1)
+    agl = np.array([frame.agl_m for frame in flight.frames])
     track = (
-        Track(smoothed.t_s[known], smoothed.xy[known], smoothed.yaw_rad[known], smoothed.sigma_m[known])
+        Track(
+            smoothed.t_s[known],
+            smoothed.xy[known],
+            smoothed.yaw_rad[known],
+            smoothed.sigma_m[known],
+            agl[known],
+            np.cumsum(~known, dtype=np.int64)[known],
+        )
         if known.any()
         else None
     )
-    agl = np.array([frame.agl_m for frame in flight.frames])
     seen = None if truth is None else np.isfinite(truth).all(axis=1)
     candidates = write_candidates(
         folder, [(e.t_s, e.candidates, e.candidate_mass, e.status) for e in estimates], maps.crs
@@ -348,7 +381,9 @@ def _write_results(
         files,
         maps.crs,
         smoothed=track,
-        reference=None if truth is None or seen is None else Track(times[seen], truth[seen]),
+        reference=None
+        if truth is None or seen is None
+        else Track(times[seen], truth[seen], segment=np.cumsum(~seen, dtype=np.int64)[seen]),
         z_m=agl,
         height_reference="ground",
     )
@@ -359,10 +394,11 @@ def _write_results(
         "method": method,
         "odometry": odometry_name(flight, source),
         "masks": masks.source,
-        "maps": str(maps.folder),
+        "maps": maps.folder.name,
         "settings": _plain_settings(settings, method),
+        "first_frame_s": float(located.seconds[0]),
     }
-    per_frame = float(np.median(located.seconds))
+    per_frame = float(located.seconds.mean())
     if scores is not None:
         (folder / "metrics.json").write_text(metrics_json(scores, per_frame, names), encoding="utf-8")
     write_flight_project(
@@ -377,7 +413,7 @@ def _write_results(
         attribution=attribution,
     )
     tables = []
-    if sift and maps.imagery is not None and flight.has_images:
+    if sift:
         tables.append(sift_table(maps, flight, truth))
     figures = _figures(maps, masks, estimates, smoothed, steps, truth)
     fixes = (folder / "fixes.csv").read_text(encoding="utf-8").splitlines()
@@ -397,7 +433,7 @@ def _write_results(
             ("masks", masks.source),
             ("odometry", names["odometry"]),
             ("height", f"{agl.min():.1f} to {agl.max():.1f} m above ground"),
-            ("maps", f"{maps.folder} ({maps.crs}, {maps.ground.gsd_m:g} m per pixel)"),
+            ("maps", f"{maps.folder.name} ({maps.crs}, {maps.ground.gsd_m:g} m per pixel)"),
             ("reference", "none" if truth is None else "of the flight folder; used for scores only"),
             ("attribution", attribution or "–"),
             ("settings", json.dumps(names["settings"])),
@@ -428,11 +464,8 @@ def _figures(
 ) -> list[ReportFigure]:
     photo = _background(maps.imagery or maps.folder / "buildings.tif")
     mask = _background(maps.folder / "buildings.tif")
-    complete = truth is not None and bool(np.isfinite(truth).all())
-    reckoned = dead_reckoning(steps, truth) if truth is not None and complete else None
-    flown = None
-    if truth is not None:
-        flown = np.concatenate([[0.0], np.nancumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1))])
+    reckoned = None if truth is None else dead_reckoning(steps, truth)
+    flown = None if truth is None else travelled_m(truth)
     errors = None if truth is None else np.linalg.norm(np.array([e.mean for e in estimates]) - truth, axis=1)
     drift = None if reckoned is None or truth is None else np.linalg.norm(reckoned - truth, axis=1)
     path = smoothed.xy if np.isfinite(smoothed.xy).any() else None
@@ -460,8 +493,8 @@ def _figures(
         ),
         ReportFigure(
             "Candidates of the first frame",
-            "Every place that fits the first frame, over the building mask (after the paper's Fig. 10); the stronger the "
-            "red, the more probable.",
+            f"{_how_many(estimates[0])} the first frame, over the building mask (after the paper's Fig. 10); the stronger "
+            "the red, the more probable.",
             first_candidates_figure(mask, estimates[0], None if truth is None else truth[0]),
             "image/png",
         ),
@@ -472,6 +505,11 @@ def _figures(
             "image/png",
         ),
     ]
+
+
+def _how_many(estimate: Estimate) -> str:
+    shown, count = len(estimate.candidates), estimate.candidate_count
+    return "Every place that fits" if shown >= count else f"{shown:,} of the {count:,} places that fit"
 
 
 def _seen(maps: Maps, masks: FrameMasks, estimates: Sequence[Estimate]) -> list[Seen]:
@@ -669,7 +707,7 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     """Writes a flight folder over built maps, in place of an earlier one; returns it."""
     from brmgeo.synth.flight import OdometryErrors, simulate
 
-    _may_replace(out, "flight.toml", "a flight")
+    _may_replace_flight(out)
     check_simulation(what)
     maps = read_maps(what.maps_dir)
     assert maps.footprints is not None
@@ -724,7 +762,7 @@ def simulate_flights(
     """Many flights, one for each (seed, folder, name), side by side; returns their folders."""
     check_simulation(what)
     for _, out, _ in jobs:
-        _may_replace(out, "flight.toml", "a flight")
+        _may_replace_flight(out)
     progress = Progress()
     with scheduler(scheduler_spec, say=progress.say) as map, progress.stage("simulate") as bar:
         return list(bar.watch(map)(_simulate_one, [(what, *job) for job in jobs]))
@@ -817,7 +855,7 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
             located = locate(known, views, flown.motions, method, match_settings(trial.own))
             rows.append(
                 FlightRow(
-                    flight=f"{trial.path}-{trial.seed}",
+                    flight=f"{_path_name(trial.path)}-{trial.seed}",
                     seed=trial.seed,
                     method=f"{method}, {kind} masks" if kind else method,
                     scores=score(located.estimates, located.smoothed.xy, flown.motions, truth),
@@ -883,6 +921,10 @@ def _views_by_masks(
             for i, image in zip(frames, images)
         ]
     return seen
+
+
+def _path_name(path: str) -> str:
+    return path if path in PATHS else Path(path).stem
 
 
 def _trial_or_why(trial: Trial) -> list[FlightRow] | str:
@@ -973,8 +1015,8 @@ def evaluate(
         raise WorkflowError(f"evaluate: none of {flights} flights could be flown; {broken[0]}")
     where = "over ground that the map does not show" if hide else "over built-up ground"
     note = (
-        f"{flights - len(broken)} simulated {'masks-only ' if masks is None else ''}flights ({path}, seeds {first_seed} to "
-        f"{first_seed + flights - 1}) {where} of {maps.folder.name}; "
+        f"{flights - len(broken)} simulated {'masks-only ' if masks is None else ''}flights ({_path_name(path)}, seeds "
+        f"{first_seed} to {first_seed + flights - 1}) {where} of {maps.folder.name}; "
         f"odometry: simulated, scale bias {scale_bias:+.0%} or the opposite, heading drift 0.75 deg per root minute; "
         f"{shown}. Nothing is aligned before it is scored."
     )
@@ -1005,17 +1047,25 @@ def compare_results(folders: Sequence[Path], out: Path | None) -> str:
             f"{', '.join(map(str, folders))}: no metrics.json below; run localize over flights with a reference first"
         )
     rows = []
+    # Results of versions before these figures still compare.
+    later = {"within_sigma", "share_smoothed"}
     for path in found:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
             within = values["within_sigma"]
-            fields = {n: values[n] for n in Scores.__dataclass_fields__ if n != "within_sigma"}
+            fields = {n: values[n] for n in Scores.__dataclass_fields__ if n not in later}
+            fields["share_smoothed"] = values.get("share_smoothed")
             scores = Scores(
                 **fields, within_sigma=None if within is None else (within[0], within[1], within[2])
             )
             rows.append(
                 FlightRow(
-                    values["flight"], 0, values["method"], scores, values["seconds_per_frame"], math.nan
+                    values["flight"],
+                    0,
+                    values["method"],
+                    scores,
+                    values["seconds_per_frame"],
+                    values.get("first_frame_s", math.nan),
                 )
             )
         except (ValueError, KeyError, TypeError) as error:
@@ -1063,11 +1113,11 @@ def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
 
     Frames, for the network to make masks of, where the maps have imagery; else masks.
     """
-    name = f"simulated-{seed}"
+    # Not the name that brmgeo simulate gives: a flight that somebody made is never replaced by this one.
+    name = f"default-{seed}"
     out = data / "source" / own.name / "flights" / name
     maps = read_maps(maps_dir.absolute())
-    pictures = "frames" if SHIPPED.is_file() else "both"
-    mode = pictures if maps.imagery is not None else "masks"
+    mode = "frames" if maps.imagery is not None else "masks"
     recipe = json.dumps(
         {
             "seed": seed,

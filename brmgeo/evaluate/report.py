@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -82,7 +83,7 @@ def cards(scores: Scores | None, seconds_per_frame: float) -> list[tuple[str, st
             "flown before the first fix",
         ),
         (_metres(scores.rmse_after_first_fix_m), "RMSE after the first fix, online"),
-        (_metres(scores.rmse_whole_m), "RMSE of the whole path, smoothed"),
+        (_metres(scores.rmse_whole_m), _smoothed_label(scores.share_smoothed)),
         (_metres(scores.odometry_rmse_m), "RMSE of odometry alone"),
         (f"{scores.share_converged:.0%}", "of frames have a fix"),
         (str(scores.false_fixes), "false fixes"),
@@ -135,6 +136,12 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_rounded(v) for v in value]
     return value
+
+
+def _smoothed_label(share: float | None) -> str:
+    if share is None or share in (0.0, 1.0):
+        return "RMSE of the whole path, smoothed"
+    return f"RMSE of the smoothed path, which says something of {math.floor(100 * share)} % of the frames"
 
 
 def _metres(value: float | None) -> str:

@@ -23,9 +23,9 @@ class Scores:
 
     Attributes:
         frames: frames with a reference.
-        flown_m: length of the reference path.
+        flown_m: length of the reference path; gaps in it are bridged by their chord.
         first_fix_s, first_fix_m: time and distance flown before the first converged estimate; None without one.
-        rmse_whole_m: of the smoothed path over the whole flight; None without one.
+        rmse_whole_m: of the smoothed path, over the frames where it says something; None without one.
         rmse_after_first_fix_m: of the online estimates that are converged, from the first fix on; None without one.
         rmse_whole_online_m: of the online best place over all frames, whatever its status.
         false_fixes: converged estimates more than 50 m off.
@@ -34,8 +34,10 @@ class Scores:
         within_sigma: share of converged estimates within 1, 2 and 3 sigma_m of the truth; a round Gaussian
             in two dimensions has 0.39, 0.86 and 0.99.
         median_after_first_fix_m, worst_after_first_fix_m: of the same errors as rmse_after_first_fix_m.
-        odometry_rmse_m, odometry_rmse_after_first_fix_m: odometry alone, started at the true pose, over the
+        odometry_rmse_m, odometry_rmse_after_first_fix_m: odometry alone, started at the first true pose, over the
             whole path and over the frames from the first fix on; None without odometry.
+        share_smoothed: share of the frames with a reference that ``rmse_whole_m`` is taken over; None without a
+            smoothed path.
     """
 
     frames: int
@@ -53,6 +55,18 @@ class Scores:
     worst_after_first_fix_m: float | None
     odometry_rmse_m: float | None
     odometry_rmse_after_first_fix_m: float | None
+    share_smoothed: float | None = None
+
+
+def travelled_m(reference_xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) float64 metres along (n, 2) positions up to each; a gap (NaN) counts its chord, spread evenly over its frames."""
+    n = len(reference_xy)
+    known = np.flatnonzero(np.isfinite(reference_xy).all(axis=1))
+    if not len(known):
+        return np.zeros(n)
+    lengths = np.linalg.norm(np.diff(reference_xy[known], axis=0), axis=1)
+    along = np.interp(np.arange(n), known, np.concatenate([[0.0], np.cumsum(lengths)]))
+    return np.asarray(along, dtype=np.float64)
 
 
 def rmse(errors: NDArray[np.float64]) -> float | None:
@@ -64,24 +78,31 @@ def rmse(errors: NDArray[np.float64]) -> float | None:
 def dead_reckoning(
     motions: Sequence[Motion], reference_xy: NDArray[np.float64], heading_from_m: float = 50.0
 ) -> NDArray[np.float64] | None:
-    """(n, 2) float64 path of odometry alone, started at the true position and heading; None without odometry.
+    """(n, 2) float64 path of odometry alone, started at the first true position and heading; None without odometry.
 
     The reference holds positions only, so the true heading at the start is that of its first
-    ``heading_from_m`` metres against the same stretch of odometry. After a gap in odometry the path stands still
-    over the gap, as odometry that starts anew at its last position would.
+    ``heading_from_m`` metres against the same stretch of odometry. Before the first frame with a reference the path is
+    NaN. After a gap in odometry the path stands still over the gap, as odometry that starts anew at its last
+    position would.
     """
     if len(motions) < 2 or all(m.step_m is None for m in motions[1:]):
         return None
+    known = np.flatnonzero(np.isfinite(reference_xy).all(axis=1))
+    if len(known) < 2:
+        return None
+    start = int(known[0])
     steps = np.array([np.zeros(2) if m.step_m is None else m.step_m for m in motions])
     steps[0] = 0.0
     path = np.cumsum(steps, axis=0)
-    flown = np.linalg.norm(reference_xy - reference_xy[0], axis=1)
+    path -= path[start]
+    path[:start] = np.nan
+    flown = np.nan_to_num(np.linalg.norm(reference_xy - reference_xy[start], axis=1))
     reach = np.flatnonzero(flown >= heading_from_m)
     end = int(reach[0]) if reach.size else int(np.argmax(flown))
-    true, told = reference_xy[end] - reference_xy[0], path[end]
+    true, told = reference_xy[end] - reference_xy[start], path[end]
     turn = math.atan2(true[1], true[0]) - math.atan2(told[1], told[0])
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    return np.asarray(reference_xy[0] + path @ rotation.T, dtype=np.float64)
+    return np.asarray(reference_xy[start] + path @ rotation.T, dtype=np.float64)
 
 
 def score(
@@ -109,7 +130,7 @@ def score(
     mean = np.array([e.mean for e in estimates], dtype=np.float64).reshape(n, 2)
     errors = np.linalg.norm(mean - reference_xy, axis=1)
     converged = np.array([e.status == "converged" for e in estimates], dtype=bool)
-    travelled = np.concatenate([[0.0], np.nancumsum(np.linalg.norm(np.diff(reference_xy, axis=0), axis=1))])
+    travelled = travelled_m(reference_xy)
     first = int(np.argmax(converged)) if converged.any() else None
     fixes = converged & known
     after = errors[fixes]
@@ -122,7 +143,8 @@ def score(
             float(np.mean(ratio <= 2)),
             float(np.mean(ratio <= 3)),
         )
-    reckoned = dead_reckoning(motions, reference_xy) if known.all() else None
+    reckoned = dead_reckoning(motions, reference_xy)
+    smoothed = None if smoothed_xy is None else np.linalg.norm(np.asarray(smoothed_xy) - reference_xy, axis=1)
     drift = None if reckoned is None else np.linalg.norm(reckoned - reference_xy, axis=1)
     t0 = estimates[0].t_s if n else 0.0
     return Scores(
@@ -130,9 +152,7 @@ def score(
         flown_m=float(travelled[-1]) if n else 0.0,
         first_fix_s=None if first is None else float(estimates[first].t_s - t0),
         first_fix_m=None if first is None else float(travelled[first]),
-        rmse_whole_m=None
-        if smoothed_xy is None
-        else rmse(np.linalg.norm(np.asarray(smoothed_xy) - reference_xy, axis=1)),
+        rmse_whole_m=None if smoothed is None else rmse(smoothed),
         rmse_after_first_fix_m=rmse(after),
         rmse_whole_online_m=rmse(errors),
         false_fixes=int(np.sum(after > FALSE_FIX_M)),
@@ -143,4 +163,7 @@ def score(
         worst_after_first_fix_m=float(after.max()) if after.size else None,
         odometry_rmse_m=None if drift is None else rmse(drift),
         odometry_rmse_after_first_fix_m=None if drift is None or first is None else rmse(drift[first:]),
+        share_smoothed=None
+        if smoothed is None or not known.any()
+        else float(np.isfinite(smoothed[known]).mean()),
     )

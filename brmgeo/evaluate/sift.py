@@ -47,8 +47,10 @@ class SiftMatcher:
         points, self._descriptors = _features(imagery, max_features)
         self._points = points
         self._index = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
-        self._index.add([self._descriptors])
-        self._index.train()
+        if len(points) >= 2:
+            # OpenCV's index breaks off over nothing, and a bare field has no feature.
+            self._index.add([self._descriptors])
+            self._index.train()
 
     def locate(
         self, image: NDArray[np.uint8], gsd_m: float, anchor_px: tuple[float, float], max_features: int = 2000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -37,6 +38,7 @@ class Track:
         yaw_rad: (n,) float64 yaw of the body in the map, counter-clockwise from east; NaN or None: unknown.
         sigma_m: (n,) float64 standard deviation of one axis, metres; NaN or None: unknown.
         z_m: (n,) float64 height, metres, of the reference that the writer is told. None: unknown.
+        segment: (n,) int that changes where the path is broken: no line is drawn across. None: it is whole.
     """
 
     t_s: NDArray[np.float64]
@@ -44,16 +46,24 @@ class Track:
     yaw_rad: NDArray[np.float64] | None = None
     sigma_m: NDArray[np.float64] | None = None
     z_m: NDArray[np.float64] | None = None
+    segment: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.t_s)
-        shapes = [a.shape for a in (self.yaw_rad, self.sigma_m, self.z_m) if a is not None]
+        shapes = [a.shape for a in (self.yaw_rad, self.sigma_m, self.z_m, self.segment) if a is not None]
         if self.xy.shape != (n, 2) or any(shape != (n,) for shape in shapes):
             raise ValueError(
                 f"a track of {n} times needs xy ({n}, 2) and the others ({n},): {self.xy.shape}, {shapes}"
             )
         if (np.diff(self.t_s) < 0).any():
             raise ValueError("a track's times must not decrease")
+
+    @property
+    def pieces(self) -> list[slice]:
+        """The unbroken stretches, in order of time."""
+        n = len(self.t_s)
+        cuts = [] if self.segment is None else (np.flatnonzero(np.diff(self.segment)) + 1).tolist()
+        return [slice(a, b) for a, b in itertools.pairwise([0, *cuts, n])] if n else []
 
     def or_nan(self, name: str) -> NDArray[np.float64]:
         """``yaw_rad``, ``sigma_m`` or ``z_m``, all NaN where the track has none."""
@@ -173,7 +183,7 @@ def _tracks(
     # Name, points and unbroken stretches of each path that there is.
     whole = (("smoothed", smoothed), ("reference", reference))
     online = ("online", converged_track(estimates), _runs(estimates))
-    return [online, *((name, track, [slice(None)]) for name, track in whole if track is not None)]
+    return [online, *((name, track, track.pieces) for name, track in whole if track is not None)]
 
 
 def _path_features(

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from brmgeo.evaluate.scores import dead_reckoning, rmse, score
+from brmgeo.evaluate.report import cards
+from brmgeo.evaluate.scores import dead_reckoning, rmse, score, travelled_m
 from brmgeo.flight.values import Estimate, Motion, Status
 
 
@@ -91,3 +92,33 @@ def test_rmse_leaves_gaps_in_the_reference_out() -> None:
 def test_lengths_that_differ_are_refused() -> None:
     with pytest.raises(ValueError, match="do not match"):
         score([estimate(0, (0, 0), "lost")], None, motions(), REFERENCE)
+
+
+def test_a_gap_in_the_reference_is_bridged_and_costs_no_figure() -> None:
+    gap = REFERENCE.copy()
+    gap[[0, 2]] = np.nan
+    np.testing.assert_allclose(travelled_m(gap), [0, 0, 30, 60, 100])
+    np.testing.assert_allclose(travelled_m(np.full((3, 2), np.nan)), 0)
+    estimates = [estimate(5.0 * i, tuple(xy), "converged") for i, xy in enumerate(REFERENCE)]
+    result = score(estimates, REFERENCE, motions(scale=1.05), gap)
+    assert result.frames == 3
+    assert result.flown_m == pytest.approx(100)
+    # Odometry starts at the first true pose, here the second frame's, and knows its heading from there on.
+    reckoned = dead_reckoning(motions(scale=1.05), gap)
+    assert reckoned is not None
+    assert np.isnan(reckoned[0]).all()
+    np.testing.assert_allclose(reckoned[1:3], [[130.0, 200.0], [161.5, 200.0]], atol=1e-9)
+    assert result.odometry_rmse_m == pytest.approx(math.sqrt((0.0 + 3.0**2 + (3.0**2 + 2.0**2)) / 3))
+
+
+def test_the_smoothed_path_s_error_says_what_share_of_the_flight_it_holds_for() -> None:
+    part = REFERENCE + [0.0, 2.0]
+    part[:2] = np.nan
+    estimates = [estimate(5.0 * i, (0, 0), "ambiguous") for i in range(5)]
+    result = score(estimates, part, motions(), REFERENCE)
+    assert result.rmse_whole_m == pytest.approx(2)
+    assert result.share_smoothed == pytest.approx(3 / 5)
+    labels = [words for _, words in cards(result, 0.1)]
+    assert any("60 % of the frames" in words for words in labels)
+    assert score(estimates, None, motions(), REFERENCE).share_smoothed is None
+    assert score(estimates, np.full((5, 2), np.nan), motions(), REFERENCE).share_smoothed == 0

@@ -43,3 +43,8 @@ def test_a_frame_from_elsewhere_gives_no_place() -> None:
     matcher = SiftMatcher(picture(1), left=0.0, top=0.0, gsd_m=0.5)
     assert matcher.locate(picture(2, 240), 0.5, (120, 120)) is None
     assert matcher.locate(np.zeros((240, 240), np.uint8), 0.5, (120, 120)) is None
+
+
+def test_imagery_without_a_feature_gives_no_place_and_no_crash() -> None:
+    matcher = SiftMatcher(np.full((300, 300), 90, np.uint8), left=0.0, top=0.0, gsd_m=0.5)
+    assert matcher.locate(picture(2, 240), 0.5, (120, 120)) is None

@@ -72,3 +72,20 @@ def test_markdown_text_and_csv_hold_every_method_and_flight() -> None:
     assert [r["method"] for r in read] == ["mask", "mask", "ratio"]
     assert read[1]["first_fix_m"] == ""
     assert float(read[0]["within_2_sigma"]) == 0.9
+
+
+def test_the_table_shows_time_all_sigmas_odometry_after_the_fix_and_what_is_smoothed() -> None:
+    half = replace(BASE, share_smoothed=0.5, first_fix_s=30.0)
+    summary = summarize(rows("mask", [half, half, NEVER]))
+    table = {line.split("  ")[0].strip(): line.split()[-1] for line in plain(summary).splitlines()}
+    assert table["first fix, median s"] == "30"
+    assert (table["fixes within 1 sigma"], table["2 sigma"], table["3 sigma"]) == ("40%", "90%", "100%")
+    assert table["odometry alone after fix, median m"] == "31.0"
+    assert table["frames smoothed"] == "50%"
+
+
+def test_a_first_frame_s_time_that_is_not_known_is_a_dash_and_an_empty_cell() -> None:
+    known, unknown = (FlightRow("f", 1, "mask", BASE, 0.1, s) for s in (0.5, float("nan")))
+    assert "nan" not in markdown(summarize([unknown])) + plain(summarize([unknown])) + rows_csv([unknown])
+    assert summarize([unknown])[0].first_frame_s is None
+    assert summarize([known, unknown])[0].first_frame_s == 0.5

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -171,3 +172,21 @@ def test_lengths_that_differ_are_refused(tmp_path: Path) -> None:
         Track(np.zeros(2), np.zeros((2, 2)), np.zeros(3))
     with pytest.raises(ValueError, match="decrease"):
         Track(np.array([1.0, 0.0]), np.zeros((2, 2)))
+
+
+def test_no_line_is_drawn_across_a_gap_of_the_smoothed_path(tmp_path: Path) -> None:
+    whole, _ = paths()
+    cut = replace(whole, segment=np.repeat([0, 3, 7], [5, 1, 6]))
+    assert [(p.start, p.stop) for p in cut.pieces] == [(0, 5), (5, 6), (6, 12)]
+    assert [(p.start, p.stop) for p in whole.pieces] == [(0, 12)]
+    write_trajectory(tmp_path, flight(), [f"{i}.jpg" for i in range(12)], CRS, smoothed=cut)
+    features = json.loads((tmp_path / "trajectory.geojson").read_text())["features"]
+    lines = [
+        len(f["geometry"]["coordinates"])
+        for f in features
+        if f["geometry"]["type"] == "LineString" and f["properties"]["path"] == "smoothed"
+    ]
+    assert lines == [5, 6]
+    drawn = pyogrio.read_dataframe(tmp_path / "trajectory.gpkg", layer="smoothed_path")
+    assert [len(line.coords) for line in drawn.geometry] == [5, 6]
+    assert len(pyogrio.read_dataframe(tmp_path / "trajectory.gpkg", layer="smoothed")) == 12

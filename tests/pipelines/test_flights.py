@@ -222,13 +222,30 @@ def test_result_files_agree_with_each_other(whole: Path, results: Path, method: 
     track = json.loads((out / "trajectory.geojson").read_text())
     points = [f for f in track["features"] if f["geometry"]["type"] == "Point"]
     shown = [p["geometry"]["coordinates"][:2] for p in points if p["properties"].get("status") == "converged"]
-    for row, lonlat in zip(fixed, shown, strict=False):
+    assert bool(shown) == (method == "mask" or bool(fixed))
+    for row, lonlat in zip(fixed, shown, strict=True):
         assert lonlat == pytest.approx([float(row["lon"]), float(row["lat"])], abs=2e-7)
     assert len(pyogrio.list_layers(out / "trajectory.gpkg")) >= 2
     tum = [line.split() for line in (out / "trajectory.tum").read_text().splitlines()]
     assert all(len(line) == 8 for line in tum)
     assert bool(tum) == (metrics["rmse_whole_m"] is not None)
-    assert json.loads((out / "trajectory.json").read_text())["epsg"] == 5187
+    facts = json.loads((out / "trajectory.json").read_text())
+    assert facts["epsg"] == 5187
+    height = {f"{f.t_s:.6f}": f.agl_m for f in frames}
+    assert [float(line[3]) for line in tum] == pytest.approx([height[line[0]] for line in tum], abs=1e-3)
+    assert metrics["share_smoothed"] == pytest.approx(len(tum) / len(rows), abs=1e-4)
+    if tum:
+        assert (facts["height_reference"], facts["rows_without_height"]) == ("ground", [])
+    if method == "mask":
+        online = {f"{float(r['t_s']):.6f}": math.radians(float(r["yaw_deg"])) for r in fixed}
+        yaws = {line[0]: 2 * math.atan2(float(line[6]), float(line[7])) for line in tum}
+        assert len(online) > 3
+        assert all(abs(math.remainder(yaws[t] - yaw, 2 * math.pi)) < 0.1 for t, yaw in online.items())
+    if method == "paper":
+        # Its sets of places say nothing of how the aircraft was turned.
+        assert facts["rows_without_yaw"] == list(range(len(tum)))
+    for name in ("metrics.json", "report.html"):
+        assert str(out.parent.parent) not in (out / name).read_text(), "no path of this machine leaves it"
     report = (out / "report.html").read_text()
     assert "http://" not in report.replace("http://www.w3.org", "")
     assert "https://" not in report
@@ -249,7 +266,7 @@ def test_same_inputs_same_bytes(maps: Path, whole: Path, results: Path, tmp_path
             if layer != "layer_styles":
                 assert ours.equals(theirs), layer
     ma, mb = json.loads(a["metrics.json"]), json.loads(b["metrics.json"])
-    assert {k for k in ma if ma[k] != mb[k]} <= {"seconds_per_frame"}
+    assert {k for k in ma if ma[k] != mb[k]} <= {"seconds_per_frame", "first_frame_s"}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -463,15 +480,95 @@ def test_commands_refuse_what_cannot_be(
 def test_folders_with_other_files_are_never_replaced(
     maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], waypoints: Path
 ) -> None:
+    localize = ("localize", "--maps", maps, "--flight", flight, "--out")
+    simulate = ("simulate", "--maps", maps, "--mode", "masks", "--path", waypoints, "--out")
+
+    def kept(words: tuple[object, ...], folder: Path, reason: str) -> None:
+        before = bytes_of(folder)
+        assert reason in say(*words, folder).line
+        assert bytes_of(folder) == before
+
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.txt").write_text("years of work")
-    for words in (
-        ("localize", "--maps", maps, "--flight", flight, "--out", mine),
-        ("simulate", "--maps", maps, "--mode", "masks", "--path", waypoints, "--out", mine),
-    ):
-        assert "other files" in say(*words).line
-    assert bytes_of(mine) == {"thesis.txt": b"years of work"}
+    kept(localize, mine, "(thesis.txt)")
+    kept(simulate, mine, "(thesis.txt)")
+    # Beside results or a simulated flight it is as precious.
+    (mine / "fixes.csv").write_text("t_s\n")
+    kept(localize, mine, "(thesis.txt)")
+    shutil.copy(mine / "thesis.txt", flight)
+    kept(simulate, flight, "(thesis.txt)")
+    (flight / "thesis.txt").unlink()
+    kept(localize, flight, "other files")
+    (mine / "thesis.txt").unlink()
+    (mine / "notes").mkdir()
+    (mine / "notes" / "a.txt").write_text("b")
+    kept(localize, mine, "(notes)")
+    # A flight that was really flown has all the names of a simulated one.
+    edit(flight / "flight.toml", job.SIMULATED_NOTE, "# Flown on a fine day")
+    kept(simulate, flight, "did not simulate")
+    assert {p.name for p in tmp_path.iterdir()} == {"mine", "flight"}
+
+
+def test_results_and_simulated_flights_are_replaced(
+    maps: Path, waypoints: Path, results: Path, whole: Path, tmp_path: Path
+) -> None:
+    ours = tmp_path / "ours"
+    shutil.copytree(results / "paper", ours)
+    (ours / "simulated-1.qgz~").write_bytes(b"of QGIS")
+    job._may_replace_results(ours)
+    shutil.copytree(whole, tmp_path / "flight")
+    job._may_replace_flight(tmp_path / "flight")
+    job._may_replace_flight(tmp_path / "new")
+    job._may_replace_results(tmp_path / "new")
+
+
+def test_sift_is_refused_where_it_cannot_be(
+    maps: Path, whole: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    words = ("localize", "--flight", whole, "--out", tmp_path / "out", "--sift", "--maps")
+    assert "masks only" in say(*words, maps).line
+    two = tmp_path / "two"
+    two.mkdir()
+    for name in ("buildings.tif", "ratio.tif"):
+        shutil.copy(maps / name, two)
+    assert "imagery.tif is not there" in say(*words, two).line
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_caption_of_the_candidates_counts_what_is_drawn() -> None:
+    from brmgeo.flight.values import Estimate
+
+    def of(shown: int, count: int) -> str:
+        places = np.zeros((shown, 2))
+        return job._how_many(
+            Estimate(
+                0.0, "ambiguous", places[0], np.eye(2), math.nan, math.nan, 0.1, places, np.ones(shown), count
+            )
+        )
+
+    assert of(40, 40) == "Every place that fits"
+    assert of(2000, 1_234_567) == "2,000 of the 1,234,567 places that fit"
+
+
+def test_the_flight_that_localize_makes_has_a_name_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, maps: Path
+) -> None:
+    made: list[tuple[Path, str]] = []
+
+    def simulate(what: job.Simulation, seed: int, out: Path, name: str) -> Path:
+        made.append((out, name))
+        out.mkdir(parents=True)
+        return out
+
+    monkeypatch.setattr(job, "simulate_flight", simulate)
+    monkeypatch.setattr(job, "native_imagery", lambda *_: None)
+    region = job.Region.model_construct(name="r", flight=job.FlightSettings(), imagery=None)
+    assert job.default_flight(region, maps, tmp_path, 1) == made[0][0]
+    # brmgeo simulate calls its own flights simulated-SEED.
+    assert [name for _, name in made] == ["default-1"] == [made[0][0].name]
+    job.default_flight(region, maps, tmp_path, 1)
+    assert len(made) == 1
 
 
 def test_a_crash_while_writing_leaves_the_old_results(
