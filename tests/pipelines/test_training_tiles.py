@@ -217,7 +217,7 @@ def test_held_out_and_flown_regions_are_for_testing_only(
     (flight / "flight.toml").write_text('name = "north"\n')
     evaluated = region.out / "evaluation"
     evaluated.mkdir()
-    with pytest.raises(Exception, match="flown over by north and the simulated flights of brmgeo evaluate"):
+    with pytest.raises(Exception, match="flown over by north, the simulated flights of brmgeo evaluate"):
         require_trainable(load_region(region.toml), region.data)
     evaluated.rmdir()
     assert "flown over by north" in cut(capsys, region).error
