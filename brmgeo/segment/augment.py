@@ -85,12 +85,13 @@ class Source(Protocol):
     """Pictures that crops are cut from. ``patch`` must depend on ``rng`` alone."""
 
     def patch(
-        self, rng: np.random.Generator, reach_m: float, near_buildings: float
+        self, rng: np.random.Generator, reach_m: float, near_buildings: float, gsd_m: float = math.inf
     ) -> tuple[U8, U8, float, tuple[float, float]]:
         """((h, w, 3) uint8 RGB, (h, w) uint8 label, GSD in metres, (row, col) to centre the crop on).
 
         ``reach_m``: no pixel further than this from the centre is needed. ``near_buildings``: the share of
-        patches to be centred near a building.
+        patches to be centred near a building. ``gsd_m``: of the crop; a source of several GSD gives none that is much
+        coarser where it has another.
         """
         ...
 
@@ -103,7 +104,7 @@ def draw_crop(
     gsd = float(math.exp(rng.uniform(math.log(low), math.log(high))))
     # Half the diagonal, and what tilting moves a corner outwards.
     reach = size_px * gsd * (math.sqrt(0.5) + math.sqrt(2) * settings.tilt) + 1.0
-    image, label, source_gsd, centre = source.patch(rng, reach, settings.near_buildings)
+    image, label, source_gsd, centre = source.patch(rng, reach, settings.near_buildings, gsd)
     image, label = cut(image, label, centre, _crop_quad(rng, size_px, gsd / source_gsd, settings), size_px)
     return recolour(image, label, gsd, rng, settings), label
 

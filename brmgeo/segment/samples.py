@@ -6,6 +6,7 @@ nothing else, so that a training run can be taken up again at any step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -21,6 +22,8 @@ from brmgeo.segment.tiles import BUILDING, UNKNOWN
 U8 = NDArray[np.uint8]
 Patch = tuple[U8, U8, float, tuple[float, float]]
 _POINTS = 20_000
+#: Crops are at most this many times finer than what they are cut from: upsampled pictures teach blur.
+_FINEST = 1.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,10 @@ class Scene:
 
 
 class Scenes:
-    """Crops anywhere in large scenes, each as often as its share of the known ground. Raises InputError for none."""
+    """Crops anywhere in large scenes, each as often as its share of the known ground.
+
+    Raises InputError for no scene, or none with known ground.
+    """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
         if not scenes:
@@ -55,9 +61,15 @@ class Scenes:
             pixels = pixels[rng.integers(pixels.size, size=min(_POINTS, pixels.size))]
             self._built.append(np.stack(np.divmod(pixels, scene.label.shape[1]), axis=-1))
             area.append(float(np.count_nonzero(scene.label != UNKNOWN)) * scene.gsd_m**2)
+        if not sum(area) > 0:
+            raise InputError(
+                f"scenes {', '.join(s.name or '?' for s in scenes)}: no pixel of them is known ground; leave them out"
+            )
         self._odds = np.array(area) / sum(area)
 
-    def patch(self, rng: np.random.Generator, reach_m: float, near_buildings: float) -> Patch:
+    def patch(
+        self, rng: np.random.Generator, reach_m: float, near_buildings: float, gsd_m: float = math.inf
+    ) -> Patch:
         """See ``Source``."""
         k = int(rng.choice(len(self._scenes), p=self._odds))
         scene, built = self._scenes[k], self._built[k]
@@ -88,7 +100,9 @@ class Mosaic:
         self._images, self._labels, self._gsd = list(images), list(labels), gsd_m
         self._side: int = images[0].shape[0]
 
-    def patch(self, rng: np.random.Generator, reach_m: float, near_buildings: float) -> Patch:
+    def patch(
+        self, rng: np.random.Generator, reach_m: float, near_buildings: float, gsd_m: float = math.inf
+    ) -> Patch:
         """See ``Source``; every tile is as near to buildings as it is."""
         side, mirrored = self._side, bool(rng.random() < 0.5)
         # One tile more than the crop needs, so that seams fall anywhere in it.
@@ -137,12 +151,17 @@ class Tiles:
         if not len(chosen):
             raise InputError("none of the training tiles is in the split asked for: cut more of them")
         self._tiles, self._chosen = tiles, np.asarray(chosen)
-        self._built = np.array([i for i in chosen if tiles.infos[i].building_share > 0])
+        self._gsd = np.array([tiles.infos[i].gsd_m for i in chosen])
+        self._built = np.array([tiles.infos[i].building_share > 0 for i in chosen])
 
-    def patch(self, rng: np.random.Generator, reach_m: float, near_buildings: float) -> Patch:
+    def patch(
+        self, rng: np.random.Generator, reach_m: float, near_buildings: float, gsd_m: float = math.inf
+    ) -> Patch:
         """See ``Source``."""
-        near = rng.random() < near_buildings and len(self._built) > 0
-        i = int(rng.choice(self._built if near else self._chosen))
+        near = rng.random() < near_buildings
+        fits = self._gsd <= max(_FINEST * gsd_m, float(self._gsd.min()))
+        built = fits & self._built
+        i = int(rng.choice(self._chosen[built if near and built.any() else fits]))
         image, label = self._tiles.read(i)
         h, w = label.shape
         row, col = rng.uniform(0.3, 0.7, 2) * (h, w)
@@ -159,10 +178,12 @@ class Mixture:
             )
         self._sources, self._odds = list(sources), np.array(weights) / sum(weights)
 
-    def patch(self, rng: np.random.Generator, reach_m: float, near_buildings: float) -> Patch:
+    def patch(
+        self, rng: np.random.Generator, reach_m: float, near_buildings: float, gsd_m: float = math.inf
+    ) -> Patch:
         """See ``Source``."""
         source = self._sources[int(rng.choice(len(self._sources), p=self._odds))]
-        return source.patch(rng, reach_m, near_buildings)
+        return source.patch(rng, reach_m, near_buildings, gsd_m)
 
 
 def blank_unknown(image: U8, label: U8, least_px: int = 13) -> U8:

@@ -2,7 +2,8 @@
 
 Step k sees crops that follow from (seed, k, place in the batch) and from nothing else, so nothing but the step's number,
 the weights and the optimiser's moments is needed to go on: a run that was killed and resumed gives the same weights, bit
-for bit on the same machine with the same number of threads, as one that was not. The checkpoint is one safetensors
+for bit on the same CPU with the same number of threads, as one that was not; on a GPU, whose sums come in no fixed order,
+nearly the same. The checkpoint is one safetensors
 file that replaces the one before atomically.
 
 AdamW (Loshchilov and Hutter 2019) under a cosine schedule with linear warm-up; binary cross-entropy plus a Tversky term
@@ -89,6 +90,9 @@ class TrainSettings:
         for name in whole:
             if getattr(self, name) < 1:
                 raise SettingsError(f"training {name} {getattr(self, name)}: give 1 or more")
+        for name in ("seed", "stop_after", "patience", "threads"):
+            if getattr(self, name) < 0:
+                raise SettingsError(f"training {name} {getattr(self, name)}: give 0 or more")
         if not 0 < self.lr < 1 or not 0 <= self.ema < 1 or not 0 <= self.warmup_steps < self.steps:
             raise SettingsError(
                 f"training lr {self.lr}, ema {self.ema}, warmup_steps {self.warmup_steps}: lr lies in (0, 1), "
@@ -270,13 +274,19 @@ class Trainer:
         """Trains to the last step or until patience runs out, from the checkpoint where there is one.
 
         ``on_epoch(run, probability)`` is called after every epoch, before its checkpoint is written, with the validation
-        crops' (n, s, s) probabilities; ``on_step(step, loss)`` after every step.
+        crops' (n, s, s) probabilities; ``on_step(step, loss)`` after every step. Raises SettingsError where the loss is
+        no number any more.
         """
         s = self._settings
         run = self.start()
         last = min(s.steps, s.stop_after or s.steps)
         while run.step < last and not self._exhausted(run):
             loss = self.advance(run)
+            if not math.isfinite(loss):
+                raise SettingsError(
+                    f"training came apart at step {run.step}: its loss is no number any more; begin again with an lr "
+                    f"smaller than {s.lr:g} or a longer warm-up, in another folder"
+                )
             if on_step:
                 on_step(run.step, loss)
             if run.step % s.epoch_steps == 0 or run.step == last:
@@ -396,22 +406,29 @@ class Trainer:
             ) from None
         if facts.get("format") != FORMAT or facts.get("version") != VERSION:
             raise InputError(f"{path}: is a checkpoint of another version; delete it to begin again")
-        if facts["digest"] != self._digest:
+        if facts.get("digest") != self._digest:
             raise InputError(
                 f"{path}: belongs to a run with other settings or data; name another folder, or delete it to begin again"
             )
-        run.model.load_state_dict(_part(tensors, "model"))
-        run.average.load_state_dict(_part(tensors, "average"))
-        run.best = _part(tensors, "best")
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in _part(tensors, "optimiser").items():
-            number, key = name.split("/")
-            state.setdefault(int(number), {})[key] = tensor
-        groups = run.optimiser.state_dict()["param_groups"]
-        run.optimiser.load_state_dict({"state": state, "param_groups": groups})
-        run.step = facts["step"]
-        run.history = [Epoch(**e) for e in facts["history"]]
-        run.losses = facts["losses"]
+        try:
+            run.model.load_state_dict(_part(tensors, "model"))
+            run.average.load_state_dict(_part(tensors, "average"))
+            run.best = _part(tensors, "best")
+            if run.best.keys() != run.average.state_dict().keys():
+                raise KeyError("best")
+            state: dict[int, dict[str, Tensor]] = {}
+            for name, tensor in _part(tensors, "optimiser").items():
+                number, key = name.split("/")
+                state.setdefault(int(number), {})[key] = tensor
+            groups = run.optimiser.state_dict()["param_groups"]
+            run.optimiser.load_state_dict({"state": state, "param_groups": groups})
+            run.step = int(facts["step"])
+            run.history = [Epoch(**e) for e in facts["history"]]
+            run.losses = list(facts["losses"])
+        except (RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"{path}: is not a whole checkpoint ({' '.join(str(error).split())[:100]}); delete it to begin again"
+            ) from None
 
 
 def _copy(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

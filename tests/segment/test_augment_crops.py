@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -209,6 +210,18 @@ def test_tiles_are_those_chosen_and_the_built_ones_where_asked() -> None:
         Tiles(Set(), [])
 
 
+def test_tiles_much_coarser_than_the_crop_are_not_drawn() -> None:
+    tiles = Set()
+    tiles.infos = [dataclasses.replace(t, gsd_m=(0.25, 0.35, 0.47)[k % 3]) for k, t in enumerate(tiles.infos)]
+    source = Tiles(tiles, range(6))
+    for gsd, allowed in ((0.2, {0.25}), (0.28, {0.25, 0.35}), (0.45, {0.25, 0.35, 0.47}), (0.1, {0.25})):
+        drawn = {source.patch(np.random.default_rng(k), 5.0, 0.5, gsd)[2] for k in range(60)}
+        assert drawn == allowed
+    plain = AugmentSettings.none(0.2)
+    fine = {int(draw_crop(source, np.random.default_rng(k), 16, plain)[0][8, 8, 0]) for k in range(30)}
+    assert fine == {0, 3}
+
+
 def test_a_mixture_draws_by_weight() -> None:
     mixture = Mixture([Scenes([painted(1, (50, 50))]), Scenes([painted(2, (60, 60))])], [3, 1])
     sizes = [mixture.patch(np.random.default_rng(k), 5.0, 0.5)[0].shape[0] for k in range(400)]
@@ -231,3 +244,6 @@ def test_scenes_whose_arrays_do_not_fit_are_refused() -> None:
         Scene(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 4), np.uint8), 0.3)
     with pytest.raises(InputError, match="no scene"):
         Scenes([])
+    nothing = Scene(np.zeros((4, 4, 3), np.uint8), np.full((4, 4), 127, np.uint8), 0.3, "fog")
+    with pytest.raises(InputError, match="scenes fog: no pixel"):
+        Scenes([nothing])

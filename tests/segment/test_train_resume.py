@@ -119,8 +119,19 @@ def test_checkpoints_of_other_runs_and_damaged_ones_are_refused(tmp_path: Path, 
     path = tmp_path / "checkpoint.safetensors"
     with safe_open(path, "pt") as file:
         facts = json.loads(file.metadata()["brmgeo"])
-    save_file(load_file(path), path, {"brmgeo": json.dumps(facts | {"version": 99})})
+    tensors = load_file(path)
+    save_file(tensors, path, {"brmgeo": json.dumps(facts | {"version": 99})})
     with pytest.raises(InputError, match="another version"):
+        own.start()
+    for part in ("model", "best"):
+        left = tensors.copy()
+        left.pop(next(n for n in left if n.startswith(part) and n.endswith("weight")))
+        save_file(left, path, {"brmgeo": json.dumps(facts)})
+        with pytest.raises(InputError, match="not a whole checkpoint"):
+            own.start()
+    del facts["step"]
+    save_file(tensors, path, {"brmgeo": json.dumps(facts)})
+    with pytest.raises(InputError, match="not a whole checkpoint"):
         own.start()
     path.write_bytes(b"\x00" * 64)
     with pytest.raises(InputError, match="is not a checkpoint"):
@@ -154,6 +165,18 @@ def test_a_run_goes_on_from_given_weights_or_refuses_them(tmp_path: Path, crops:
     other = UNetSettings(widths=(8, 16, 32))
     with pytest.raises(InputError, match="not of a U-Net"):
         Trainer(other, SETTINGS, mild, source, crops, tmp_path / "third", "", weights).start()
+
+
+def test_a_run_that_comes_apart_stops_at_once(tmp_path: Path, crops: Any) -> None:
+    own = trainer(tmp_path, crops)
+    run = own.start()
+    with torch.no_grad():
+        next(run.model.parameters()).fill_(math.nan)
+    own.save(run)
+    before = (tmp_path / "checkpoint.safetensors").read_bytes()
+    with pytest.raises(SettingsError, match="came apart at step 1"):
+        own.train()
+    assert (tmp_path / "checkpoint.safetensors").read_bytes() == before
 
 
 def test_patience_stops_a_run_that_gets_no_better(tmp_path: Path, crops: Any) -> None:
@@ -202,8 +225,9 @@ def test_the_rate_rises_then_falls_to_a_hundredth() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"steps": 0}, {"lr": 0.0}, {"ema": 1.0}, {"warmup_steps": 2000}, {"device": "tpu"}, {"batch": 0}]
-)
+    "bad", [{"steps": 0}, {"lr": 0.0}, {"ema": 1.0}, {"warmup_steps": 2000}, {"device": "tpu"}, {"batch": 0}, {"seed": -1},
+     {"stop_after": -5}],
+)  # fmt: skip
 def test_settings_that_cannot_train_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(SettingsError, match="training"):
         TrainSettings(**bad)
