@@ -27,7 +27,7 @@ from rasterio.enums import ColorInterp
 from brmgeo.flight.readings import Attitude
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
-from brmgeo.segment.predict import SHIPPED, Segmenter
+from brmgeo.segment.predict import Segmenter
 from brmgeo.synth.flight import FlightSettings as Simulated
 from brmgeo.synth.flight import Ground, Simulator, fly
 from pipelines import flights
@@ -502,7 +502,6 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
 # ---------------------------------------------------------------- the real flight
 
 
-@pytest.mark.skipif(not SHIPPED.is_file(), reason="no weights have been shipped yet")
 def test_every_real_frame_registers_on_the_map_by_the_shipped_network(
     real_maps: Path, tmp_path: Path
 ) -> None:
