@@ -716,7 +716,10 @@ def _inspect_flight(path: Path) -> list[str]:
 
 
 def _where(flight: Flight) -> str:
-    reference = flight.reference(LONLAT)
+    try:
+        reference = flight.reference(LONLAT)
+    except InputError as error:
+        return f"cannot be used: {error}"
     if reference is None:
         return "none: nothing here says where it was flown"
     lon, lat = reference.xy_m.mean(axis=0)

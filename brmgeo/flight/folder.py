@@ -707,6 +707,7 @@ def _check_area(path: Path, table: Table, names: tuple[str, str], crs: str) -> N
     if area is None:
         return
     lon, lat = transformer(crs, LONLAT).transform(table.numbers[names[0]], table.numbers[names[1]])
+    lon = np.where(np.isfinite(lon), lon, np.nan)  # infinite: no place at all
     west, south, east, north = area.bounds
     slack = 1.0
     off_lon = (

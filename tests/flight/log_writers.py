@@ -351,8 +351,11 @@ def px4(path: Path, *, version: str = "local", **options: Any) -> Path:
 # ---------------------------------------------------------------- ArduPilot dataflash and telemetry
 
 
-def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True) -> Path:
-    """An ArduPilot .bin: FMT records, then rows in order of time. ``era`` is TimeUS or TimeMS (before 2015)."""
+def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True, vision: float | None = None) -> Path:
+    """An ArduPilot .bin: FMT records, then rows in order of time. ``era`` is TimeUS or TimeMS (before 2015).
+
+    ``vision`` times the positions are told as those of a camera, too (NaN: by one that saw nothing).
+    """
     us = era == "TimeUS"
     clock = "Q" if us else "I"
     name = "XKF1" if us else "EKF1"
@@ -364,6 +367,8 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True) -> Path
         "CAM": (134, clock + "H", f"{era},Img"),
         "GPS": (135, *(("QBIHLLf", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt") if us else ("BILLfI", old))),
     }  # fmt: skip
+    if vision is not None:
+        formats["VISP"] = (136, clock + "ffffffB", f"{era},PX,PY,PZ,Roll,Pitch,Yaw,Rst")
     if position:
         formats[name] = (
             132,
@@ -391,6 +396,8 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True) -> Path
         y, p, r = (float(v) for v in NED_YPR_DEG[i])
         row("IMU", t, *map(float, GYRO_FRD[i]), *map(float, ACCEL_FRD[i]))
         row("ATT", t, r, p, y % 360.0)
+        if vision is not None:
+            row("VISP", t, *(float(v) * vision for v in NED[i]), r, p, y % 360.0, int(i >= 200))
         if position:
             row(
                 name,

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from log_writers import XYZ, N, T, bag, shots_of, telemetry
+from log_writers import XYZ, N, T, bag, dataflash, shots_of, telemetry
 
 from brmgeo.errors import FlightError
 from brmgeo.flight.camera import distort
@@ -148,6 +148,19 @@ def test_time_marks_are_of_the_camera_already(tmp_path: Path) -> None:
     assert gnss is not None
     assert gnss.lat_deg.tolist() == pytest.approx([36.5, 36.5001, 36.5002], abs=1e-9)
     assert gnss.lon_deg.tolist() == pytest.approx([128.5] * 3, abs=1e-9)
+
+
+def test_a_dataflash_log_of_a_camera_that_saw_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink")
+    seen = read_log(dataflash(tmp_path / "seen.bin", vision=1.0)).odometry
+    assert seen is not None
+    assert seen.source == "VISP"
+    assert np.abs(seen.xyz_m - XYZ).max() < 1e-3
+    assert seen.segment is not None
+    assert np.flatnonzero(np.diff(seen.segment)).tolist() == [199]
+    blind = read_log(dataflash(tmp_path / "blind.bin", vision=float("nan")))
+    assert blind.candidates == ("XKF1",)
+    assert read_log(dataflash(tmp_path / "alone.bin", vision=float("nan"), position=False)).odometry is None
 
 
 @pytest.mark.parametrize("what", ["local_position_ned", "attitude", "vision_position_estimate"])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import click
 import cv2
@@ -55,7 +55,7 @@ def test_a_fast_aircraft_is_no_reset_where_its_speed_is_allowed(folder: Path) ->
     assert [m.step_m is None for m in motions_of(flight)] == [True] * 4
     steps = motions_of(flight, None, 100.0)
     assert [m.step_m is None for m in steps] == [True, False, False, False]
-    slow = replace(cast(Flight, flight), odometry=track(30.0))
+    slow = replace(flight, odometry=track(30.0))
     # A low bound is of movement without odometry: the track itself is believed up to what aircraft fly.
     assert all(m.step_m is not None for m in motions_of(slow, None, 8.0)[1:])
 
@@ -127,6 +127,10 @@ def test_inspect_says_where_a_flight_was(folder: Path) -> None:
     rows = [f"{i},{x},{y}" for i in range(4)]
     (folder / "reference.csv").write_text("\n".join(["t_s,x,y", *rows]) + "\n")
     assert "about 36.02000 N 129.35000 E" in command("inspect", folder)[1]
+    (folder / "reference.csv").write_text("t_s,x,y\n0,1e9,1e9\n1,1e9,1e9\n")
+    status, said = command("inspect", folder)
+    assert status == 0
+    assert "reference  cannot be used: " in said
 
 
 def test_import_says_what_it_leaves_out(tmp_path: Path) -> None:
@@ -245,11 +249,11 @@ def test_a_thinned_flight_is_there_whole_or_not_at_all(folder: Path, monkeypatch
     def full(source: object, target: object) -> None:
         if str(target).endswith("f2.png"):
             raise OSError(28, "No space left on device", str(target))
-        copy2(source, target)  # type: ignore[call-overload]
+        copy2(source, target)
 
-    copy2 = odometry.shutil.copy2
+    copy2 = shutil.copy2
     with monkeypatch.context() as context:
-        context.setattr(odometry.shutil, "copy2", full)
+        context.setattr(shutil, "copy2", full)
         with pytest.raises(OSError, match="No space"):
             odometry.thin_flight(folder, out, 2.0)
     assert sorted(p.name for p in folder.parent.iterdir()) == ["flight"]
