@@ -4,7 +4,7 @@ A recipe is a TOML file (data/recipes): the U-Net, the training run, the augment
 of one of these kinds:
 
 - ``generated``: towns that brmgeo invents, by seed, painted once and kept in data/work/scenes;
-- ``tiles``: training tiles that ``brmgeo tiles`` cut, of regions by name (cut now where they are not there yet);
+- ``tiles``: training tiles of regions by name, as ``brmgeo tiles`` cuts them (cut now where they are not as wanted);
 - ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
 - ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
 - ``flight``: a flight folder whose frames have masks; for tests only.
@@ -21,11 +21,10 @@ import json
 import math
 import os
 import re
-import tempfile
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -39,9 +38,9 @@ from brmgeo.flight.folder import read_flight
 from brmgeo.geo.grid import lattice
 from brmgeo.maps.rasterize import building_mask
 from brmgeo.region import describe_fault
-from brmgeo.segment.augment import AugmentSettings, Source, shrunk
+from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, shrunk
 from brmgeo.segment.metrics import LogitHistogram, Scores, segmentation_scores
-from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles, blank_unknown
+from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles
 from brmgeo.segment.shards import TileSet, check_label, read_tiles
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
 from brmgeo.synth.day import another_day
@@ -72,7 +71,8 @@ class SourceSpec(_Spec):
     """One source of a recipe; see the head of this file for the kinds.
 
     ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation.
-    ``tiles`` that are for training take their regions' own train and validation splits. ``weight``: how often the
+    ``tiles`` that are for training take their regions' own train and validation splits; a region is in one source
+    only. ``weight``: how often the
     source is drawn in training.
     """
 
@@ -142,9 +142,16 @@ def generated_scene(seed: int, size_m: float, gsd_m: float, day: int, cache: Pat
         image = render_imagery(town, box)
         mask = building_mask([b.polygon for b in town.buildings], box.affine, (box.shape[0], box.shape[1]))
         cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=cache, suffix=".part", delete=False) as file:
-            np.save(file, np.dstack([image, mask * np.uint8(BUILDING)]))
-        os.replace(file.name, path)
+        for old in cache.glob(".town-*.part"):  # what killed runs left
+            if time.time() - old.stat().st_mtime > 3600:
+                old.unlink(missing_ok=True)
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            with part.open("wb") as file:
+                np.save(file, np.dstack([image, mask * np.uint8(BUILDING)]))
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
     both = np.load(path)
     return Scene(np.ascontiguousarray(both[..., :3]), np.ascontiguousarray(both[..., 3]), gsd_m, name)
 
@@ -152,8 +159,11 @@ def generated_scene(seed: int, size_m: float, gsd_m: float, day: int, cache: Pat
 def read_pairs(folder: Path) -> tuple[list[str], list[U8], list[U8]]:
     """Names, RGB images and labels of ``folder``/images and /masks.
 
-    Raises MissingInputError where there are none or one of a pair is missing, InputError for unreadable or unequal ones.
+    Transparent pixels and plain black or white areas are unknown. Raises MissingInputError where there are none or one
+    of a pair is missing, InputError for unreadable, cut short or unequal ones and for more than 8 bits.
     """
+    from pipelines import training
+
     names, images, labels = [], [], []
     pictures = sorted(p for p in (folder / "images").glob("*") if p.suffix.lower() in _PICTURES)
     if not pictures:
@@ -166,16 +176,10 @@ def read_pairs(folder: Path) -> tuple[list[str], list[U8], list[U8]]:
             raise MissingInputError(
                 f"{mask_path}: is not there, but {path.name} is: every image needs its mask"
             )
-        image, mask = (
-            cv2.imread(str(path), cv2.IMREAD_COLOR),
-            cv2.imread(str(mask_path), cv2.IMREAD_UNCHANGED),
-        )
-        if image is None or mask is None or image.shape[:2] != mask.shape[:2]:
-            raise InputError(f"{path}: it or its mask cannot be read, or their sizes differ")
-        image = np.ascontiguousarray(image[..., ::-1])
+        image, label = training.read_pair(path, mask_path)
         names.append(path.stem)
         images.append(image)
-        labels.append(blank_unknown(image, check_label(mask, mask_path.name)))
+        labels.append(label)
     return names, images, labels
 
 
@@ -198,7 +202,12 @@ def xyz_scenes(folder: Path, zoom: int, validation_share: float) -> tuple[list[S
     # Ground metres: web-mercator's pixel shrinks with the cosine of the latitude.
     y = sum(k[1] for k in tiles) / len(tiles)
     latitude = math.atan(math.sinh(math.pi * (1 - 2 * (y + 0.5) / 2**zoom)))
-    side = next(iter(tiles.values()))[1].shape[0]
+    shapes = sorted({label.shape for _, label in tiles.values()})
+    side = shapes[0][0]
+    if shapes != [(side, side)]:
+        raise InputError(
+            f"{folder}: tiles of {', '.join(f'{w} x {h}' for h, w in shapes)} px: web tiles are square, all of one size"
+        )
     gsd = 40_075_016.69 * math.cos(latitude) / 2**zoom / side
     groups = sorted(_touching(set(tiles)), key=lambda g: (-len(g), min(g)))
     columns = sorted({x for x, _ in groups[0]})
@@ -291,7 +300,7 @@ def gather(
     crops: list[tuple[str, Source]] = []
     frames: dict[str, dict[str, list[Picture]]] = {"validation": {}, "test": {}}
     credits = []
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(f"{recipe.work_gsd_m!r} {recipe.validation_crops}".encode())
 
     def use(name: str, split: str, scenes: list[Scene], weight: float) -> None:
         if not scenes:
@@ -308,6 +317,8 @@ def gather(
                 digest.update(hashlib.sha256(scene.image.tobytes() + scene.label.tobytes()).digest())
 
     for spec in _checked(recipe, data, paths, test_regions, say):
+        if spec.split != "test":
+            digest.update(spec.model_dump_json(exclude={"attribution", "licence"}).encode())
         if spec.kind == "generated":
             cache = data / "work" / "scenes"
             gsd = spec.gsd_m or recipe.work_gsd_m
@@ -345,12 +356,18 @@ def gather(
         credits.append(
             {
                 k: getattr(spec, k)
-                for k in ("name", "kind", "split", "attribution", "licence")
+                for k in ("name", "kind", "split", "regions", "seeds", "attribution", "licence")
                 if getattr(spec, k)
             }
         )
     if not train or not crops:
         raise SettingsError(f"recipe {recipe.title!r}: names no ground to train on, or none to validate on")
+    for split, sets in frames.items():
+        for name, pictures in sets.items():
+            if not pictures:
+                raise SettingsError(
+                    f"recipe source {name}: no frame of it for {split} has known ground: give it more, or leave it out"
+                )
     mixture = Mixture([s for s, _ in train], [w for _, w in train])
     return Ground(mixture, crops, frames["validation"], frames["test"], credits, digest.hexdigest())
 
@@ -380,14 +397,27 @@ def _checked(
     own = [
         SourceSpec(name=r, kind="tiles", split="test", regions=(r,)) for r in test_regions if r not in named
     ]
+    every = [s.name for s in recipe.source]
+    for name in every:
+        if every.count(name) > 1:
+            raise SettingsError(f"recipe source {name}: two sources have this name; give each its own")
+    towns = [r for s in recipe.source for r in s.regions]
+    for region in towns:
+        if towns.count(region) > 1:
+            raise SettingsError(
+                f"recipe: region {region} is named twice; its tiles are cut for one purpose, so name it once"
+            )
     used = []
     for spec in (*recipe.source, *own):
+        if (spec.kind == "generated" and not spec.seeds) or (spec.kind == "tiles" and not spec.regions):
+            needs = "seeds" if spec.kind == "generated" else "regions"
+            raise SettingsError(f"recipe source {spec.name}: is of kind {spec.kind} and names no {needs}")
         if spec.kind == "flight" and spec.split != "test":
             raise SettingsError(f'recipe source {spec.name}: a flight is for tests only: split = "test"')
         if spec.kind == "pairs" and (spec.gsd_m is None or spec.split != "train"):
             raise SettingsError(f"recipe source {spec.name}: pairs are for training, and need their gsd_m")
         if spec.kind == "tiles":
-            training.require_all_trainable(spec.regions, data, "test" if spec.split == "test" else None)
+            training.require_all_trainable(spec.regions, data, spec.split)
         if spec.name not in names or spec.name in paths:
             used.append(spec)
         elif spec.split == "test":
@@ -439,21 +469,30 @@ def _flight_frames(folder: Path) -> list[Picture]:
 def _tile_sources(
     spec: SourceSpec, data: Path, work_gsd_m: float
 ) -> Iterator[tuple[str, float, Source, list[Picture], bytes]]:
-    """(split, weight, source, frames, digest) of each region's tiles; the tiles are cut first where they are not there."""
+    """(split, weight, source, frames, digest) of each region's tiles, which are cut for that, or found to be.
+
+    Tiles that are for training are divided as the region file says; those that are not are all of the one split.
+    Raises SettingsError for a region without tiles to train on.
+    """
     from pipelines import training
 
     for region in spec.regions:
-        folder = data / "out" / region / "tiles"
-        if not (folder / "tiles.json").is_file():
-            training.cut_region(region, data, None, None, "test" if spec.split == "test" else None)
-        tiles = read_tiles(folder)
+        # A cut that is fresh costs nothing; one for another purpose, such as --split test, must not be trained on.
+        align = training.last_aligned(region, data)
+        whole = None if spec.split == "train" else spec.split
+        tiles = read_tiles(training.cut_region(region, data, None, None, whole, align=align))
         share = spec.weight / len(spec.regions)
-        for split in ("test",) if spec.split == "test" else ("train", "validation"):
-            chosen = tiles.of_split(split) if spec.split != "test" else list(range(len(tiles)))
+        if whole is None and not tiles.of_split("train"):
+            raise SettingsError(
+                f"recipe source {spec.name}: region {region} has no tile to train on (its [training] split is for other "
+                'uses); take it out, or set split = "blocks" in its region file'
+            )
+        for split in ("train", "validation") if whole is None else (whole,):
+            chosen = tiles.of_split(split)
             if not chosen:
                 continue
-            seen = hashlib.sha256(json.dumps([asdict(tiles.infos[i]) for i in chosen]).encode()).digest()
-            yield split, share, Tiles(tiles, chosen), _tile_frames(tiles, chosen, work_gsd_m), seen
+            frames = _tile_frames(tiles, chosen, work_gsd_m)
+            yield split, share, Tiles(tiles, chosen), frames, tiles.digest(chosen)
 
 
 def _tile_frames(tiles: TileSet, chosen: Sequence[int], work_gsd_m: float) -> list[Picture]:
@@ -467,6 +506,11 @@ def _tile_frames(tiles: TileSet, chosen: Sequence[int], work_gsd_m: float) -> li
 # --- the run -----------------------------------------------------------------------------------------------------
 
 
+def _cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """A settings dataclass from a recipe's table."""
     known = {f.name for f in fields(kind)}  # type: ignore[arg-type]
@@ -476,10 +520,24 @@ def _settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
             f"recipe, [{where}]: no setting {foreign[0]!r}; there are: {', '.join(sorted(known))}"
         )
     plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    for own in fields(kind):  # type: ignore[arg-type]
+        if own.name in plain and own.default is not MISSING and not _alike(plain[own.name], own.default):
+            raise SettingsError(
+                f"recipe, [{where}]: {own.name} = {values[own.name]!r}: give it in the form of {own.default!r}"
+            )
     try:
         return kind(**plain)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise SettingsError(f"recipe, [{where}]: {error}") from None
+
+
+def _alike(value: Any, example: Any) -> bool:
+    """True where a value has the type of the example: whole numbers, numbers, yes or no, text, or lists of these."""
+    if isinstance(example, tuple):
+        return isinstance(value, tuple) and all(_alike(v, example[0]) for v in value)
+    if isinstance(example, float):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is type(example)
 
 
 def train(
@@ -496,7 +554,7 @@ def train(
 ) -> dict[str, Any]:
     """Trains by a recipe, or takes up where a run in ``out`` ended, then calibrates, tests and writes the results.
 
-    ``out`` receives weights.safetensors and .md (the card), model.onnx, metrics.json, curves.csv and .png, reliability.png,
+    ``out`` receives model.safetensors and .md (the card), model.onnx, metrics.json, curves.csv and .png, reliability.png,
     pictures/epoch-NNN.png and checkpoint.safetensors; returns what is in metrics.json. ``start``: weights
     (.safetensors) to go on from in place of random ones. Raises SettingsError, InputError.
     """
@@ -511,7 +569,16 @@ def train(
     augment = _settings(AugmentSettings, recipe.augment, "augment")
     if steps is not None:
         settings = replace(settings, steps=steps, warmup_steps=min(settings.warmup_steps, steps // 4))
-    settings = replace(settings, threads=threads or os.cpu_count() or 1)
+    if unet.in_channels != 3:
+        raise SettingsError(
+            f"recipe, [unet]: in_channels {unet.in_channels}: pictures have 3, red, green and blue"
+        )
+    if not augment.gsd_m[0] <= recipe.work_gsd_m <= augment.gsd_m[1]:
+        raise SettingsError(
+            f"recipe: work_gsd_m {recipe.work_gsd_m:g} lies outside the crops' [augment] gsd_m {list(augment.gsd_m)}: "
+            "pictures would be resampled to what was never trained for"
+        )
+    settings = replace(settings, threads=threads or settings.threads or _cores())
     ground = gather(recipe, data, paths or {}, test_regions, augment.gsd_m[0], say)
     crops = engine.validation_crops(
         [s for _, s in ground.crops], recipe.validation_crops, settings.crop_px, recipe.work_gsd_m
@@ -519,7 +586,14 @@ def train(
     initial = None
     if start is not None:
         initial, before = load_weights(start)
-        ground.credits.append({"name": f"weights {before.digest}", "kind": "start", "data": before.data})
+        ground.credits.append(
+            {
+                "name": f"weights {before.digest}, which it went on from",
+                "kind": "start",
+                "licence": before.licence,
+                "data": before.data,
+            }
+        )
     out.mkdir(parents=True, exist_ok=True)
     trainer = engine.Trainer(unet, settings, augment, ground.train, crops, out, ground.digest, initial)
     say(
@@ -562,10 +636,10 @@ def finish(
     state: Mapping[str, Any], unet: Any, recipe: Recipe, augment: AugmentSettings, ground: Ground, out: Path,
     say: Callable[[str], None], steps: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Calibrates on validation frames, writes weights, card and ONNX, and scores them as a user would run them."""
+    """Calibrates on validation frames, scores as ``brmgeo segment`` would answer, writes weights, card and ONNX."""
     from brmgeo.segment.onnx_export import export_onnx
     from brmgeo.segment.predict import Segmenter
-    from brmgeo.segment.train import MEAN, STD, tensors_of
+    from brmgeo.segment.train import tensors_of
     from brmgeo.segment.weights import ModelCard, save_weights
 
     low, high = augment.gsd_m
@@ -575,11 +649,10 @@ def finish(
         data={"recipe": recipe.title, "steps": steps, "sources": ground.credits},
         licence=licence_of(ground.credits),
     )  # fmt: skip
-    weights = out / "weights.safetensors"
+    weights = out / "model.safetensors"
     tensors = tensors_of(state)
     save_weights(weights, tensors, card)
-    export_onnx(weights, out / "model.onnx")
-    raw = Segmenter.load(out / "model.onnx")
+    raw = Segmenter.load(weights, "torch")
     # Every kind of validation ground counts the same, whatever its area.
     histogram, parts = LogitHistogram(), []
     for pictures in ground.validation.values():
@@ -606,10 +679,12 @@ def finish(
     }
     say(f"calibrated on validation: temperature {card.temperature}, threshold {card.threshold}")
     save_weights(weights, tensors, card)
-    export_onnx(weights, out / "model.onnx")
-    segmenter = Segmenter.load(out / "model.onnx")
+    segmenter = Segmenter.load(weights, "torch")
     scores = {
-        f"{split}: {name}": score(segmenter, pictures).summary()
+        # What cannot be told of a source (features of frames without room for a disc) is left out.
+        f"{split}: {name}": {
+            k: v for k, v in score(segmenter, pictures).summary().items() if math.isfinite(v)
+        }
         for split, sets in (("validation", ground.validation), ("test", ground.test))
         for name, pictures in sets.items()
     }
@@ -636,7 +711,11 @@ def score(segmenter: Any, pictures: Sequence[Picture]) -> Scores:
 
 def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
     """One line for the model card: the weights' own licence and what their sources ask for."""
-    asked = [f"{c['name']}: {c.get('attribution', '')} ({c['licence']})" for c in credits if c.get("licence")]
+    asked = [
+        f"{c['name']}: " + (f"{c['attribution']} ({c['licence']})" if c.get("attribution") else c["licence"])
+        for c in credits
+        if c.get("licence")
+    ]
     return "Apache-2.0 for the weights" + ("; trained on " + "; ".join(asked) if asked else "")
 
 
@@ -688,7 +767,9 @@ def _draw_reliability(path: Path, histogram: LogitHistogram, temperature: float)
         xlabel="probability said", ylabel="share that is building", xlim=(0, 1), ylim=(0, 1), aspect="equal"
     )
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    part = path.with_name(f".{path.name}.part")
+    figure.savefig(part, dpi=110, format="png")
+    part.replace(path)
 
 
 def _show(path: Path, images: U8, labels: U8, probability: F32, most: int = 24, columns: int = 8) -> None:

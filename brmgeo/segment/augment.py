@@ -24,6 +24,8 @@ from brmgeo.segment.tiles import BUILDING, UNKNOWN
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
+#: Of red, green and blue, 0 to 1: what the network's input is normalised with, and what stands where nothing was seen.
+MEAN, STD = (0.45, 0.45, 0.42), (0.22, 0.21, 0.21)
 _ROOFS = np.array(  # light and dark grey, brown, beige, brick, slate blue, white: shingles, tiles, metal of many countries
     [
         (188, 188, 184), (150, 150, 148), (104, 102, 100), (70, 68, 68), (122, 100, 84), (96, 78, 66),
@@ -99,14 +101,20 @@ class Source(Protocol):
 def draw_crop(
     source: Source, rng: np.random.Generator, size_px: int, settings: AugmentSettings
 ) -> tuple[U8, U8]:
-    """One training crop: ((size, size, 3) uint8 RGB, (size, size) uint8 label), from ``source`` and ``rng`` alone."""
+    """One training crop: ((size, size, 3) uint8 RGB, (size, size) uint8 label), from ``source`` and ``rng`` alone.
+
+    Unknown ground that is plain black or white has the mean colour, as the network meets it in use.
+    """
     low, high = settings.gsd_m
     gsd = float(math.exp(rng.uniform(math.log(low), math.log(high))))
     # Half the diagonal, and what tilting moves a corner outwards.
     reach = size_px * gsd * (math.sqrt(0.5) + math.sqrt(2) * settings.tilt) + 1.0
     image, label, source_gsd, centre = source.patch(rng, reach, settings.near_buildings, gsd)
     image, label = cut(image, label, centre, _crop_quad(rng, size_px, gsd / source_gsd, settings), size_px)
-    return recolour(image, label, gsd, rng, settings), label
+    plain = (image == 0).all(-1) | (image == 255).all(-1)
+    image = recolour(image, label, gsd, rng, settings)
+    image[plain & (label == UNKNOWN)] = np.rint(255 * np.array(MEAN))
+    return image, label
 
 
 def _crop_quad(
@@ -224,12 +232,14 @@ def recolour(image: U8, label: U8, gsd_m: float, rng: np.random.Generator, setti
     if rng.random() < settings.noise:
         sigma = rng.uniform(1.0, 9.0)
         grey = rng.standard_normal((*label.shape, 1), np.float32)
-        img = img + np.float32(sigma) * (0.8 * grey + 0.4 * rng.standard_normal(img.shape, np.float32))
+        noise = 0.8 * grey + 0.4 * rng.standard_normal(img.shape, np.float32)
+        img = np.asarray(img + np.float32(sigma) * noise, np.float32)
     out = np.clip(img, 0, 255).astype(np.uint8)
     if rng.random() < settings.jpeg:
-        ok, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
+        bgr = np.ascontiguousarray(out[..., ::-1])
+        ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
         assert ok
-        out = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+        out = np.ascontiguousarray(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
     return out
 
 
@@ -238,7 +248,7 @@ def _roofs(img: F32, label: U8, rng: np.random.Generator) -> F32:
     count, parts = cv2.connectedComponents((label == BUILDING).astype(np.uint8), connectivity=4)
     if count < 2:
         return img
-    chosen = rng.random(count) < rng.uniform(0.4, 1.0)
+    chosen: NDArray[np.bool_] = np.asarray(rng.random(count) < rng.uniform(0.4, 1.0))
     chosen[0] = False
     colours = _ROOFS[rng.integers(len(_ROOFS), size=count)] * rng.normal(1, 0.12, (count, 1))
     colours = (colours + rng.normal(0, 12, (count, 3))).astype(np.float32)
