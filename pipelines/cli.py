@@ -247,7 +247,10 @@ def tiles(
     help="The folder of a source that the recipe names; repeatable.",
 )
 @click.option(
-    "--out", type=DATA, help="Where results go (default data/out/REGION/unet, or data/out/RECIPE/unet)."
+    "--out",
+    type=DATA,
+    help="Where results go (default data/out/REGION/unet, of another recipe unet-RECIPE; without REGION "
+    "data/out/RECIPE/unet).",
 )
 @click.option("--steps", type=click.IntRange(min=1), help="Train this many steps, in place of the recipe's.")
 @click.option("--threads", type=click.IntRange(min=1), help="Processor threads (default: all).")
@@ -278,10 +281,12 @@ def train(
         if not (name and sign and folder):
             raise SettingsError(f"train --source {text}: give NAME=PATH, such as kampala=../kampala")
         folders[name] = Path(folder)
+    # Runs by two recipes are two runs: neither takes up the other's checkpoint.
+    folder = f"unet-{path.stem}" if region and path.stem != "short" else "unet"
     job.train(
         path,
         data,
-        out or data / "out" / (region or path.stem) / "unet",
+        out or data / "out" / (region or path.stem) / folder,
         paths=folders,
         test_regions=(region,) if region else (),
         steps=steps,
@@ -381,6 +386,13 @@ def why(region: str, stage: str, data: Path) -> None:
     help="Seconds between frames (default: the region's, 5); 0.1 to 0.5 is what brmgeo odometry follows best.",
 )
 @click.option("--compass", is_flag=True, help="Write a compass heading (3 deg) into frames.csv.")
+@click.option(
+    "--settings",
+    "settings_file",
+    type=FILE,
+    help="A TOML file with the simulator's settings: mount, distortion, errors of masks and odometry, blur, noise, ... "
+    "(docs/FLIGHT.md has an example); the options above win over it.",
+)
 def simulate(
     region: str | None,
     data: Path,
@@ -397,8 +409,9 @@ def simulate(
     no_odometry: bool,
     interval_s: float | None,
     compass: bool,
+    settings_file: Path | None,
 ) -> None:
-    """Simulate a flight over REGION: frames, masks, odometry, IMU, altimeter and reference in one folder."""
+    """Simulate a flight over REGION: frames or masks, odometry and reference in one folder; IMU and altimeter with frames."""
     from pipelines import flights as job
     from pipelines.maps import native_imagery
 
@@ -413,7 +426,7 @@ def simulate(
     own, folder, _ = job.maps_for("simulate", region, maps_dir, data, scheduler)
     what = job.Simulation(
         folder.absolute(), own.flight, path, mode, scale_bias, no_odometry=no_odometry, compass=compass,
-        interval_s=interval_s,
+        interval_s=interval_s, settings_file=None if settings_file is None else settings_file.absolute(),
     )  # fmt: skip
     flights = data / "source" / own.name / "flights"
     with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:

@@ -670,6 +670,7 @@ class Simulation:
         interval_s: seconds between frames; None for the region's.
         imagery: a (h, w, 3) picture by path in place of the maps' own, for flights on another day; None for the maps'.
         native: the region's imagery where that is finer than its maps: frames are drawn from it.
+        settings_file: a TOML file with settings of the simulator in place of the region's and the defaults; None for none.
     """
 
     maps_dir: Path
@@ -682,6 +683,25 @@ class Simulation:
     interval_s: float | None = None
     imagery: Path | None = None
     native: NativeImagery | None = None
+    settings_file: Path | None = None
+
+    def settings(self) -> Any:
+        """The simulator's settings: the region's, then the file's, then the options'; SettingsError for a bad file."""
+        from brmgeo.synth.flight import OdometryErrors
+        from pipelines.simulation import read_simulation_settings
+
+        made = simulator_settings(self.own)
+        if self.settings_file is not None:
+            made = read_simulation_settings(self.settings_file, made)
+        if self.no_odometry:
+            made = replace(made, odometry=None)
+        elif self.scale_bias is not None:
+            made = replace(
+                made, odometry=replace(made.odometry or OdometryErrors(), scale_bias=self.scale_bias)
+            )
+        if self.interval_s is not None:
+            made = replace(made, frame_interval_s=self.interval_s)
+        return replace(made, compass_error_deg=3.0) if self.compass else made
 
     def imagery_file(self) -> Path | None:
         """The picture that frames are drawn from; None where none are drawn."""
@@ -691,7 +711,8 @@ class Simulation:
 
 
 def check_simulation(what: Simulation) -> None:
-    """Raises MissingInputError when the maps lack what a simulation needs."""
+    """Raises MissingInputError when the maps lack what a simulation needs, SettingsError for a bad file of settings."""
+    what.settings()
     maps = read_maps(what.maps_dir)
     if maps.footprints is None:
         raise MissingInputError(
@@ -705,25 +726,19 @@ def check_simulation(what: Simulation) -> None:
 
 def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     """Writes a flight folder over built maps, in place of an earlier one; returns it."""
-    from brmgeo.synth.flight import OdometryErrors, simulate
+    from brmgeo.synth.flight import simulate
 
     _may_replace_flight(out)
     check_simulation(what)
     maps = read_maps(what.maps_dir)
     assert maps.footprints is not None
     ground = read_ground(maps.footprints)
-    changes: dict[str, Any] = {
-        "odometry": None if what.no_odometry else OdometryErrors(scale_bias=what.scale_bias)
-    }
-    if what.interval_s is not None:
-        changes["frame_interval_s"] = what.interval_s
-    if what.compass:
-        changes["compass_error_deg"] = 3.0
-    settings = simulator_settings(what.own, **changes)
+    settings = what.settings()
     route = flight_path(what.path, ground, seed, maps.bounds, maps.crs)
     file = what.imagery_file()
     native = what.native if what.imagery is None else None
-    imagery = None if file is None else _imagery_of(what.own, route, native, file)
+    own = what.own.model_copy(update={"agl_m": settings.agl_m, "fov_deg": _seen_deg(settings)})
+    imagery = None if file is None else _imagery_of(own, route, native, file)
     with _whole_folder(out) as scratch:
         simulate(
             scratch,
@@ -737,6 +752,14 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
             name=name,
         )
     return out
+
+
+def _seen_deg(settings: Any) -> float:
+    """The cone about straight down, degrees, that a simulated camera sees across its short side, tilt counted in."""
+    camera, mount = settings.camera, settings.mount
+    fov = 2 * math.degrees(math.atan(camera.half_fov_tan))
+    tilt = math.degrees(math.hypot(mount.roll_rad, mount.pitch_rad))
+    return float(max(fov, min(fov + 2 * tilt, 150.0)))
 
 
 def _imagery_of(own: FlightSettings, route: FloatArray, native: NativeImagery | None, file: Path) -> Any:

@@ -118,7 +118,7 @@ def smooth_path(
 
 
 def _about(motion: Motion, mean: F64, covariance: F64, settings: OdometrySettings) -> tuple[F64, F64] | None:
-    """(3,) x, y, yaw of the body about which a view is registered and its (3, 3) covariance; None where the yaw is not known."""
+    """(3,) x, y, yaw of the body about which a view is registered and its covariance; None where that yaw is unknown."""
     pose, spread = mean[:3].copy(), covariance[:3, :3].copy()
     if motion.yaw_rad is not None:
         pose[2] = wrap(float(mean[2]) + motion.yaw_rad)
