@@ -836,7 +836,7 @@ def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         found = np.repeat(found[..., None], 3, axis=2)
     if found.shape[-1] not in (3, 4):
         raise InputError(f"{path}: has {found.shape[-1]} bands; give grey, RGB or RGBA pictures")
-    seen = found[..., 3] >= 128 if found.shape[-1] == 4 else np.ones(found.shape[:2], np.bool_)
+    seen = found[..., 3] > 0 if found.shape[-1] == 4 else np.ones(found.shape[:2], np.bool_)
     rgb = np.ascontiguousarray(found[..., 2::-1])
     rgb[~seen] = 0
     return rgb, seen

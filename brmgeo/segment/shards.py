@@ -13,6 +13,7 @@ A folder of tiles holds
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -233,6 +234,11 @@ class TileSet:
     def of_split(self, split: str) -> list[int]:
         """Numbers of the tiles of a split (``train``, ``validation``, ``test``)."""
         return [i for i, info in enumerate(self.infos) if info.split == split]
+
+    def digest(self, chosen: Sequence[int]) -> bytes:
+        """SHA-256 of what the index says of the tiles ``chosen``, the checksums of their images and labels with it."""
+        rows = [entry_row((self.infos[i], self._places[i])) for i in chosen]
+        return hashlib.sha256(json.dumps(rows).encode()).digest()
 
     def read(self, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """(image (h, w, 3) uint8 RGB, label (h, w) uint8) of tile ``i``.

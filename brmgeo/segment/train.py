@@ -32,13 +32,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from brmgeo.errors import InputError, SettingsError
-from brmgeo.segment.augment import AugmentSettings, Source, draw_crop
+from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, draw_crop
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
 from brmgeo.segment.unet import UNet, UNetSettings
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
-MEAN, STD = (0.45, 0.45, 0.42), (0.22, 0.21, 0.21)
 FORMAT, VERSION = "brmgeo-checkpoint", 1
 
 
