@@ -246,7 +246,7 @@ def test_one_reading_is_no_imu(folder: Path) -> None:
 def test_a_thinned_flight_is_there_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = folder.parent / "thin"
 
-    def full(source: object, target: object) -> None:
+    def full(source: Path, target: Path) -> None:
         if str(target).endswith("f2.png"):
             raise OSError(28, "No space left on device", str(target))
         copy2(source, target)
