@@ -13,7 +13,9 @@ import pytest
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.region import load_region
-from pipelines import network
+from brmgeo.segment.predict import Segmenter
+from brmgeo.segment.shards import TileInfo
+from pipelines import network, training
 from pipelines.cli import cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,6 +103,42 @@ def test_pairs_that_are_none_are_refused(tmp_path: Path) -> None:
         network.read_pairs(tmp_path)
 
 
+def test_pairs_cut_short_transparent_or_of_other_sizes(tmp_path: Path) -> None:
+    write_tiles(tmp_path, [(1, 1), (2, 1)], 12)
+    image = tmp_path / "images" / "OAM-2-1-12.png"
+    seen = np.dstack([np.full((32, 32, 3), 90, np.uint8), np.full((32, 32), 255, np.uint8)])
+    seen[:, :10, 3] = 0
+    cv2.imwrite(str(image), seen)
+    label = network.read_pairs(tmp_path)[2][1]
+    assert (label[:, :10] == 127).all()
+    assert not (label[:, 10:] == 127).any()
+    for part in ("images", "masks"):
+        cv2.imwrite(str(tmp_path / part / image.name), np.full((48, 48), 255, np.uint8))
+    with pytest.raises(InputError, match="32 x 32, 48 x 48 px: web tiles are square"):
+        network.xyz_scenes(tmp_path, 12, 0.0)
+    cv2.imwrite(str(image), np.full((48, 48), 40000, np.uint16))
+    with pytest.raises(InputError, match="uint16"):
+        network.read_pairs(tmp_path)
+    noise = np.random.default_rng(1).integers(0, 255, (48, 48, 3), dtype=np.uint8)
+    whole = cv2.imencode(".jpg", noise)[1].tobytes()
+    image.unlink()
+    image.with_suffix(".jpg").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="cut short"):
+        network.read_pairs(tmp_path)
+
+
+def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:
+    credits = [
+        {"name": "far", "attribution": "Those who flew", "licence": "CC BY 4.0"},
+        {"name": "weights 0123, which it went on from", "licence": "ODbL 1.0"},
+        {"name": "own"},
+    ]
+    assert network.licence_of(credits) == (
+        "Apache-2.0 for the weights; trained on far: Those who flew (CC BY 4.0); "
+        "weights 0123, which it went on from: ODbL 1.0"
+    )
+
+
 def test_a_generated_scene_is_painted_once_and_labels_its_roofs(tmp_path: Path) -> None:
     scene = network.generated_scene(901, 300.0, 0.25, 0, tmp_path)
     (file,) = tmp_path.iterdir()
@@ -142,8 +180,23 @@ def test_recipes_that_are_wrong_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="not valid TOML"):
         network.read_recipe(path)
     path.write_text(TINY.replace("steps = 4", "stepz = 4"))
-    with pytest.raises(SettingsError, match="no setting 'stepz'"):
-        network.train(path, tmp_path, tmp_path / "out")
+    for wrong, said in {
+        "stepz = 4": "no setting 'stepz'",
+        "steps = 4.5": "steps = 4.5: give it in the form of",
+        "steps = 4\nseed = -1": "seed -1: give 0 or more",
+        'steps = 4\nlr = "high"': "lr = 'high'",
+    }.items():
+        path.write_text(TINY.replace("steps = 4", wrong))
+        with pytest.raises(SettingsError, match=said):
+            network.train(path, tmp_path, tmp_path / "out")
+    for right, wrong, said in (
+        ("gsd_m = [0.2, 0.4]", "gsd_m = [0.2]", "augment"),
+        ("gsd_m = [0.2, 0.4]", "gsd_m = [0.3, 0.4]", "work_gsd_m 0.25 lies outside"),
+        ("widths = [8, 16]", "widths = [8, 16]\nin_channels = 4", "pictures have 3"),
+    ):
+        path.write_text(TINY.replace(right, wrong))
+        with pytest.raises(SettingsError, match=said):
+            network.train(path, tmp_path, tmp_path / "out")
 
 
 def gather(recipe: str, tmp_path: Path, **paths: Path) -> Any:
@@ -160,6 +213,13 @@ def test_sources_that_are_wrong_are_refused(tmp_path: Path) -> None:
         gather(TINY, tmp_path, nowhere=tmp_path)
     with pytest.raises(SettingsError, match="tests only"):
         gather(TINY.replace('kind = "flight"\nsplit = "test"', 'kind = "flight"'), tmp_path, flown=tmp_path)
+    with pytest.raises(SettingsError, match="two sources have this name"):
+        gather(TINY.replace('name = "far"', 'name = "held"'), tmp_path)
+    with pytest.raises(SettingsError, match="names no seeds"):
+        gather(TINY.replace("seeds = [903]", ""), tmp_path)
+    for regions in ("[]", '["a", "a"]'):
+        with pytest.raises(SettingsError, match=r"names no regions|named twice"):
+            gather(TINY + f'[[source]]\nname = "own"\nkind = "tiles"\nregions = {regions}\n', tmp_path)
 
 
 def test_a_region_that_is_held_out_is_never_trained_on(tmp_path: Path) -> None:
@@ -168,6 +228,45 @@ def test_a_region_that_is_held_out_is_never_trained_on(tmp_path: Path) -> None:
     own = TINY + '[[source]]\nname = "own"\nkind = "tiles"\nregions = ["demo"]\n'
     with pytest.raises(SettingsError, match="held out"):
         gather(own, tmp_path)
+
+
+def test_tiles_are_cut_for_what_they_are_wanted_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Tiles for validation are never trained on, those of a region without training tiles are refused."""
+    asked: list[Any] = []
+
+    class Cut:
+        def __init__(self, splits: list[str]) -> None:
+            self.infos = [
+                TileInfo(str(k), 0, 0.25, s, "a", 0.1, 1.0, (0, 0, 1, 1), "") for k, s in enumerate(splits)
+            ]
+
+        def of_split(self, split: str) -> list[int]:
+            return [i for i, info in enumerate(self.infos) if info.split == split]
+
+        def digest(self, chosen: list[int]) -> bytes:
+            return bytes(chosen)
+
+        def read(self, i: int, /) -> Any:
+            return np.zeros((64, 64, 3), np.uint8), np.zeros((64, 64), np.uint8)
+
+    def cut_region(name: str, data: Path, out: None, spec: None, split: str | None, align: bool) -> Cut:
+        asked.append(split)
+        return Cut([split] * 3 if split else ["train", "validation"] if name == "a" else ["test"])
+
+    monkeypatch.setattr(training, "cut_region", cut_region)
+    monkeypatch.setattr(training, "last_aligned", lambda *args: False)
+    monkeypatch.setattr(training, "require_all_trainable", lambda *args: [])
+    monkeypatch.setattr(network, "read_tiles", lambda tiles: tiles)
+    found = {
+        split: [part for part, *_ in network._tile_sources(
+            network.SourceSpec(name="t", kind="tiles", split=split, regions=("a",)), tmp_path, 0.3
+        )]
+        for split in ("train", "validation", "test")
+    }  # fmt: skip
+    assert found == {"train": ["train", "validation"], "validation": ["validation"], "test": ["test"]}
+    assert asked == [None, "validation", "test"]
+    with pytest.raises(SettingsError, match="region b has no tile to train on"):
+        gather(TINY + '[[source]]\nname = "own"\nkind = "tiles"\nregions = ["a", "b"]\n', tmp_path)
 
 
 @pytest.mark.slow
@@ -181,17 +280,29 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
     made = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert made == {
         "checkpoint.safetensors", "curves.csv", "curves.png", "metrics.json", "model.onnx", "reliability.png",
-        "weights.md", "weights.safetensors", "pictures/epoch-001.png", "pictures/epoch-002.png",
+        "model.md", "model.safetensors", "pictures/epoch-001.png", "pictures/epoch-002.png",
     }  # fmt: skip
     assert json.loads((out / "metrics.json").read_text()) == facts
     assert set(facts["scores"]) == {"validation: held", "test: far"}
-    assert 0 <= facts["scores"]["test: far"]["iou"] <= 1
+    segmenter = Segmenter.load(out / "model.safetensors")
+    assert segmenter.backend == "onnx"  # the graph beside it, by its name
+    hit = union = 0
+    for picture in gather(TINY, tmp_path).test["far"]:
+        image, label = picture.read()
+        mask = segmenter.mask(image, picture.gsd_m)
+        hit += int(((mask == 255) & (label == 255)).sum())
+        union += int(((mask == 255) | (label == 255)).sum())
+    assert facts["scores"]["test: far"]["iou"] == pytest.approx(hit / union, abs=2e-4)
+    assert {"seeds": [901]}.items() <= segmenter.card.data["sources"][0].items()
     assert len((out / "curves.csv").read_text().splitlines()) == 3
-    weights = (out / "weights.safetensors").read_bytes()
+    weights = (out / "model.safetensors").read_bytes()
     said.clear()
     network.train(recipe, tmp_path, out, say=said.append)
     assert not any(line.startswith("epoch") for line in said)
-    assert (out / "weights.safetensors").read_bytes() == weights
+    assert (out / "model.safetensors").read_bytes() == weights
+    recipe.write_text(TINY.replace("seeds = [901]", "seeds = [901]\nweight = 2.0"))
+    with pytest.raises(InputError, match="other settings or data"):
+        network.train(recipe, tmp_path, out, say=said.append)
 
 
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -200,5 +311,9 @@ def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_p
     cli(["train", "demo", "--data", str(tmp_path), "--source", "a=b", "--steps", "5"], standalone_mode=False)
     assert seen["args"] == (tmp_path / "recipes" / "short.toml", tmp_path, tmp_path / "out" / "demo" / "unet")
     assert (seen["paths"], seen["test_regions"], seen["steps"]) == ({"a": Path("b")}, ("demo",), 5)
+    cli(["train", "demo", "--recipe", "shipped", "--data", str(tmp_path)], standalone_mode=False)
+    assert seen["args"][2] == tmp_path / "out" / "demo" / "unet-shipped"
+    cli(["train", "--recipe", "shipped", "--data", str(tmp_path)], standalone_mode=False)
+    assert seen["args"][2] == tmp_path / "out" / "shipped" / "unet"
     with pytest.raises(SettingsError, match="NAME=PATH"):
         cli(["train", "--source", "a"], standalone_mode=False)
