@@ -411,7 +411,7 @@ def simulate(
     compass: bool,
     settings_file: Path | None,
 ) -> None:
-    """Simulate a flight over REGION: frames or masks, odometry and reference in one folder; IMU and altimeter with frames."""
+    """Simulate a flight over REGION: frames or masks, odometry and reference in one folder; an IMU with frames."""
     from pipelines import flights as job
     from pipelines.maps import native_imagery
 
@@ -699,6 +699,32 @@ def segment(
         bands=None if bands is None else tuple(int(b) for b in bands),
     )
     click.echo(line)
+
+
+@cli.command()
+@click.argument("results", type=DATA)
+@click.option(
+    "--path",
+    "what",
+    type=click.Choice(["online", "smoothed", "reference", "candidates"]),
+    default="online",
+    show_default=True,
+    help="The online fixes, the smoothed path, the reference, or the candidates of all frames.",
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help="The file to write: .gpkg, .geojson or .csv.",
+)
+@click.option(
+    "--crs", help="CRS to write in, such as EPSG:4326 (default: the map's; GeoJSON: always degrees)."
+)
+def export(results: Path, what: str, out: Path, crs: str | None) -> None:
+    """Write a path or the candidates of RESULTS (a folder that localize wrote) in another format or CRS."""
+    from pipelines import results as job
+
+    click.echo(job.export_results(results, what, out, crs))
 
 
 @cli.command("export-onnx")

@@ -1,0 +1,96 @@
+"""brmgeo export writes the very points of the results, in the CRS and format that are asked for."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyogrio
+import pytest
+from pyproj import Transformer
+
+from brmgeo.errors import BrmgeoError, CrsError, MissingInputError, SettingsError
+from brmgeo.export.candidates import write_candidates
+from brmgeo.export.trajectory import Track, write_trajectory
+from brmgeo.flight.values import Estimate
+from pipelines.cli import cli, run
+from pipelines.results import export_results
+
+CRS = "EPSG:5187"
+XY = np.array([[195_100.25 + 10 * i, 445_900.5 + 3 * i] for i in range(6)])
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    out = tmp_path / "results"
+    out.mkdir()
+    estimates = [
+        Estimate(5.0 * i, "converged" if i > 1 else "ambiguous", xy, np.eye(2), 0.5, 0.1, 1.0, xy[None], np.ones(1), 1)
+        for i, xy in enumerate(XY)
+    ]  # fmt: skip
+    smoothed = Track(np.arange(6) * 5.0, XY + 0.5, np.full(6, np.nan), np.full(6, 1.5))
+    write_trajectory(out, estimates, [f"{i}.jpg" for i in range(6)], CRS, smoothed=smoothed)
+    write_candidates(out, [(e.t_s, e.candidates, e.candidate_mass, e.status) for e in estimates], CRS)
+    return out
+
+
+def test_points_are_those_of_the_results_in_every_format(results: Path, tmp_path: Path) -> None:
+    lonlat = np.column_stack(Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(*XY.T))
+    out = tmp_path / "a.csv"
+    assert "smoothed, 6 points" in export_results(results, "smoothed", out, None)
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    np.testing.assert_allclose([[float(r["x"]), float(r["y"])] for r in rows], XY + 0.5, atol=1e-4)
+    assert [float(r["sigma_m"]) for r in rows] == [1.5] * 6
+    assert {r["yaw_deg"] for r in rows} == {""}
+
+    out = tmp_path / "b.geojson"
+    export_results(results, "online", out, None)
+    features = json.loads(out.read_text())["features"]
+    np.testing.assert_allclose([f["geometry"]["coordinates"] for f in features], lonlat[2:], atol=2e-7)
+    assert [f["properties"]["file"] for f in features] == ["2.jpg", "3.jpg", "4.jpg", "5.jpg"]
+
+    out = tmp_path / "c.gpkg"
+    for crs, places in ((None, XY), ("EPSG:4326", lonlat)):
+        export_results(results, "candidates", out, crs)
+        frame = pyogrio.read_dataframe(out, layer="candidates")
+        assert frame.crs.to_epsg() == (5187 if crs is None else 4326)
+        np.testing.assert_allclose(
+            np.column_stack([frame.geometry.x, frame.geometry.y]), places, atol=0.02 if crs is None else 2e-7
+        )
+        assert frame["frame"].tolist() == list(range(6))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "b.geojson", "c.gpkg", "results"]
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "crs", "error", "words"),
+    [
+        ("reference", "a.csv", None, MissingInputError, "no reference path; there are online, smoothed"),
+        ("online", "a.dwg", None, SettingsError, ".geojson"),
+        ("online", "none/a.csv", None, SettingsError, "no folder"),
+        ("online", "a.geojson", "EPSG:5187", SettingsError, "leave --crs out"),
+        ("online", "a.csv", "EPSG:999999", CrsError, "999999"),
+        ("online", "results/trajectory.gpkg", None, SettingsError, "choose another name"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(
+    results: Path, tmp_path: Path, what: str, name: str, crs: str | None, error: type[BrmgeoError], words: str
+) -> None:
+    before = (results / "trajectory.gpkg").read_bytes()
+    with pytest.raises(error, match=re.escape(words)):
+        export_results(results, what, tmp_path / name, crs)
+    assert (results / "trajectory.gpkg").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["results"]
+
+
+def test_the_command_refuses_a_folder_that_is_no_result(
+    results: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    call: Callable[..., int] = lambda *words: run(lambda: cli([str(w) for w in words], standalone_mode=False))  # noqa: E731
+    assert call("export", tmp_path, "--out", tmp_path / "a.csv") == 2
+    assert "brmgeo localize wrote" in capfd.readouterr().err
+    assert call("export", results, "--out", tmp_path / "a.csv") == 0
+    assert "online, 4 points" in capfd.readouterr().out
