@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brmgeo.errors import InputError, SettingsError
-from brmgeo.segment.augment import AugmentSettings, cut, draw_crop, recolour, shrunk
+from brmgeo.segment.augment import MEAN, AugmentSettings, cut, draw_crop, recolour, shrunk
 from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles, blank_unknown
 from brmgeo.segment.shards import TileInfo
 
@@ -125,6 +125,34 @@ def test_courts_and_pools_are_drawn_on_open_ground_only() -> None:
         assert not changed[scene.label == 255].any()
         drawn += bool(changed.any())
     assert drawn >= 3
+
+
+def test_what_nobody_saw_has_the_mean_colour_as_in_use() -> None:
+    scene = painted(13, (400, 400))
+    scene.image[:200], scene.label[:200] = 0, 127
+    scene.label[200:220] = 127  # seen, but on no map
+    settings = AugmentSettings(gsd_m=(0.3, 0.3), turn=False, tilt=0.0, near_buildings=0.0)
+    filled = 0
+    for seed in range(12):
+        image, label = draw_crop(Scenes([scene]), np.random.default_rng(seed), 64, settings)
+        mean = (image == np.rint(255 * np.array(MEAN))).all(-1)
+        assert (mean & (label != 127)).mean() < 0.01
+        filled += int(mean.sum())
+        if (label == 127).all():
+            assert mean.mean() > 0.9
+    assert filled > 2000
+
+
+def test_jpeg_keeps_each_colour_in_its_channel() -> None:
+    """Chroma is stored coarsely: of luma's weights red's is more than twice blue's, so a pattern in blue blurs more."""
+    only = AugmentSettings(roofs=0, objects=0, colour=0, shadow=0, haze=0, blur=0, noise=0, jpeg=1)
+    lost = []
+    for channel in (0, 2):
+        image = np.full((64, 64, 3), 128, np.uint8)
+        image[::2, ::2, channel] = 250
+        out = recolour(image, np.zeros((64, 64), np.uint8), 0.3, np.random.default_rng(3), only)
+        lost.append(np.abs(out[..., channel].astype(int) - image[..., channel]).mean())
+    assert lost[1] > lost[0]
 
 
 @pytest.mark.parametrize(
