@@ -60,6 +60,7 @@ from pipelines.masks import (
     frame_masks,
     network_mask,
     network_name,
+    network_warning,
     photographed,
     slant_gsd_m,
 )
@@ -225,9 +226,8 @@ def localize(
     settings = match_settings(own)
     steps = motions_of(flight, yaws, own.max_speed_m_s)
     source = _source_of(flight)
-    with frame_masks(
-        flight, f"{source}: masks/ of the flight folder", network or NetworkUse(), progress
-    ) as masks:
+    given, use = f"{source}: masks/ of the flight folder", network or NetworkUse()
+    with frame_masks(flight, given, use, progress, maps.folder.name) as masks:
         with progress.stage(f"{flight.name} {method}") as bar:
             views = bar.watch(serial_map)(
                 functools.partial(view_at, flight, maps.ground.gsd_m, masks=masks), range(len(flight.frames))
@@ -1024,6 +1024,10 @@ def evaluate(
         for seed in range(first_seed, first_seed + flights)
     ]
     progress = Progress()
+    if masks is not None and "network" in masks.kinds:
+        warning = network_warning(masks.weights, maps.folder.name)
+        if warning:
+            progress.say(warning)
     rows: list[FlightRow] = []
     broken: list[str] = []
     out.mkdir(parents=True, exist_ok=True)

@@ -48,6 +48,7 @@ from brmgeo.segment.predict import (
     scaled_levels,
     spans,
 )
+from brmgeo.segment.weights import ModelCard
 from brmgeo.workflow.progress import Bar, Progress
 
 Answer = Literal["mask", "probability"]
@@ -123,11 +124,14 @@ class NetworkUse:
 
 
 @contextmanager
-def frame_masks(flight: Flight, given: str, use: NetworkUse, progress: Progress) -> Iterator[FrameMasks]:
+def frame_masks(
+    flight: Flight, given: str, use: NetworkUse, progress: Progress, region: str = ""
+) -> Iterator[FrameMasks]:
     """The masks of a flight's frames, for as long as the block lasts; the network runs on frames not seen before.
 
     Args:
         given: what reports call masks of the flight folder.
+        region: whose maps the flight is matched with; where the network was trained on it, that is said.
 
     Raises InputError for frames that are damaged or of another size, MissingInputError without weights or frames.
     """
@@ -139,6 +143,8 @@ def frame_masks(flight: Flight, given: str, use: NetworkUse, progress: Progress)
             f"{flight.folder}: the network is to make masks, but the flight has no frames; put them into frames/"
         )
     segmenter = Segmenter.load(use.weights)
+    if warning := trained_over(segmenter.card, region):
+        progress.say(f"{flight.name}: {warning}")
     with tempfile.TemporaryDirectory(prefix="brmgeo-masks-") as scratch:
         files = _ask(flight, segmenter, use.cache or Path(scratch), progress)
         threshold = segmenter.card.threshold if use.answer == "mask" else None
@@ -156,6 +162,25 @@ def above_roofs_m(agl_m: float, roof_m: float) -> float:
 @functools.lru_cache(maxsize=2)
 def _segmenter(weights: Path | None, threads: int | None) -> Segmenter:
     return Segmenter.load(weights, threads=threads)
+
+
+def trained_over(card: ModelCard, region: str) -> str:
+    """What is to be said where a network was trained on the region that it is used over; empty where it was not."""
+    sources = card.data.get("sources", []) if isinstance(card.data, dict) else []
+    named = {
+        name
+        for source in (sources if isinstance(sources, list) else [])
+        if isinstance(source, dict) and source.get("split") != "test"
+        for name in source.get("regions", ())
+    }
+    if region not in named:
+        return ""
+    return f"the network was trained on region {region}, so results over it look better than elsewhere"
+
+
+def network_warning(weights: Path | None, region: str) -> str:
+    """``trained_over`` of the network of these weights; raises as ``Segmenter.load``."""
+    return trained_over(_segmenter(weights, 1).card, region)
 
 
 def network_name(weights: Path | None) -> str:

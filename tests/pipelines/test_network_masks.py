@@ -176,6 +176,19 @@ def test_given_masks_are_used_unless_the_network_is_wanted(
     assert "has no frames" in say(*words, "--masks", "network").line
 
 
+def test_a_network_over_ground_it_was_trained_on_is_told(
+    pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sources = [{"name": "t", "regions": ["town-a"]}, {"name": "g", "split": "test", "regions": ["town-g"]}]
+    own = bright_onnx(tmp_path / "own.onnx", small_card(data={"sources": sources}))
+    card = job.Segmenter.load(own, threads=1).card
+    assert job.trained_over(card, "town-g") == job.trained_over(card, "") == ""
+    assert "trained on region town-a" in job.network_warning(own, "town-a")
+    flight = job.read_flight(pictured)
+    with job.frame_masks(flight, "", job.NetworkUse(weights=own), job.Progress(), "town-a"):
+        assert "trained on region town-a" in capsys.readouterr().err
+
+
 def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
     """Boxes 6 m high seen from 100 m aslant: laid onto a plane at 6 m their roofs are the map's outlines."""
     rng = np.random.default_rng(3)
