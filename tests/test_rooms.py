@@ -16,11 +16,11 @@ VALUES = {
     "brmgeo.flight.values",
     "brmgeo.flight.readings",
     "brmgeo.flight.frames",
+    "brmgeo.flight.camera",
 }
 KERNELS = {
     "brmgeo.maps.ratio",
     "brmgeo.match",
-    "brmgeo.flight.camera",
     "brmgeo.flight.view",
     "brmgeo.flight.motion",
     "brmgeo.flight.checks",
