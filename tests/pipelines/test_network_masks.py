@@ -515,6 +515,7 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
 # ---------------------------------------------------------------- the real flight
 
 
+@pytest.mark.slow
 def test_every_real_frame_registers_on_the_map_by_the_shipped_network(
     real_maps: Path, tmp_path: Path
 ) -> None:

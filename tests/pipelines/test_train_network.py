@@ -230,6 +230,7 @@ def test_a_region_that_is_held_out_is_never_trained_on(tmp_path: Path) -> None:
         gather(own, tmp_path)
 
 
+@pytest.mark.slow
 def test_tiles_are_cut_for_what_they_are_wanted_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Tiles for validation are never trained on, those of a region without training tiles are refused."""
     asked: list[Any] = []

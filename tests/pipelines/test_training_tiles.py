@@ -327,6 +327,7 @@ def test_options_are_refused_in_one_line(tiled: SmallRegion, tmp_path: Path, cap
 # --- labels beside the imagery -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_labels_are_moved_onto_the_imagery_when_asked(tmp_path: Path, capsys: Capture) -> None:
     bounds, shift = (184_900.0, 451_000.0, 185_340.0, 451_440.0), (2.4, -1.6)
     town = generate_town(bounds, 31)
