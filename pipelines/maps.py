@@ -58,7 +58,7 @@ def run_source(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
 
     manifest = write_region(
         out,
-        _bounds(settings["bounds"]),
+        as_bounds(settings["bounds"]),
         settings["seed"],
         settings["sheets"],
         crs=settings["crs"],
@@ -95,7 +95,7 @@ def run_outlines(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         max_dropped_share=settings["max_dropped_share"],
     )
     if len(read.frame) and not settings["sheet"]:
-        check_extent(_bounds(read.frame.total_bounds), settings["crs"], settings["sheets"], what=name)
+        check_extent(as_bounds(read.frame.total_bounds), settings["crs"], settings["sheets"], what=name)
     # NGII's shapefiles all have one name: what two of them hold must still be told apart.
     read.frame["source"] = name
     read.sheets["source"] = name
@@ -171,7 +171,7 @@ def run_lattice(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
             basis = (
                 "bounding box of the footprints; state --sheets or --bounds where the map is known further"
             )
-    frame = _bounds(bounds if bounds is not None else shapely.total_bounds([p for _, p in known]))
+    frame = as_bounds(bounds if bounds is not None else shapely.total_bounds([p for _, p in known]))
     box = lattice(frame, crs, gsd_m)
     if box.shape[0] * box.shape[1] > MAX_PIXELS:
         raise SettingsError(
@@ -181,7 +181,7 @@ def run_lattice(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     area = float(shapely.union_all([p for _, p in known]).intersection(shapely.box(*bounds_of(box))).area)
     if area == 0.0:
         raise SettingsError(
-            f"the region's bounds {_rounded(frame)} ({crs}) share no ground with its sheets {_listed(settings['sheets'])}; "
+            f"the region's bounds {_rounded(frame)} ({crs}) share no ground with its sheets {listed(settings['sheets'])}; "
             "correct the bounds, the sheets or the crs"
         )
     text = {
@@ -205,7 +205,7 @@ def read_lattice(folder: Path) -> tuple[GeoBox, tuple[tuple[str, shapely.Geometr
     """The lattice that a ``lattice`` artifact holds, and its named known areas."""
     text = json.loads((folder / "lattice.json").read_text(encoding="utf-8"))
     known = tuple((name, shapely.from_wkt(wkt)) for name, wkt in text["known"])
-    return lattice(_bounds(text["bounds"]), text["crs"], text["gsd_m"]), known
+    return lattice(as_bounds(text["bounds"]), text["crs"], text["gsd_m"]), known
 
 
 # --- footprints: all files together, buildings cut at sheet edges made whole ---------------------------------
@@ -220,7 +220,7 @@ def run_footprints(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     whole = combine([read_outlines(path) for path in inputs.values()])
     if not len(whole.frame):
         raise InputError(
-            f"{_listed(list(inputs))}: no building outline in any of them; check [footprints] layers"
+            f"{listed(list(inputs))}: no building outline in any of them; check [footprints] layers"
         )
     write_footprints_gpkg(
         out / "footprints.gpkg",
@@ -256,8 +256,8 @@ def run_imagery(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     source = json.dumps(settings["source"])
     files = settings["source"]["files"]
     root = str(inputs[files[0]].parent if files else inputs["imagery"])
-    check_imagery(_imagery_sources(source, root), box)
-    windows = list(blocks(_shape(box), BLOCK_PX))
+    check_imagery(imagery_sources(source, root), box)
+    windows = list(blocks(shape_of(box), BLOCK_PX))
     seen = 0
 
     def pieces() -> Iterator[tuple[Window, tuple[NDArray[np.uint8], NDArray[np.bool_]]]]:
@@ -286,7 +286,7 @@ def _imagery_block(source: str, root: str, lattice_dir: Path, window: Window) ->
     from brmgeo.ingest.imagery import mosaic_to_lattice
 
     box, _ = read_lattice(lattice_dir)
-    return mosaic_to_lattice(_imagery_sources(source, root), box, window)
+    return mosaic_to_lattice(imagery_sources(source, root), box, window)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +304,7 @@ class NativeImagery:
 
         box = lattice(bounds, self.crs, self.gsd_m)
         left, _, _, top = bounds_of(box)
-        return mosaic_to_lattice(_imagery_sources(self.source, self.root), box)[0], left, top
+        return mosaic_to_lattice(imagery_sources(self.source, self.root), box)[0], left, top
 
 
 def native_imagery(region: Region, data: Path) -> NativeImagery | None:
@@ -320,13 +320,13 @@ def native_imagery(region: Region, data: Path) -> NativeImagery | None:
     root = places[source["files"][0]].parent if source["files"] else places["imagery"]
     box, _ = read_lattice(places["lattice"])
     text = json.dumps(source)
-    native = native_gsd_m(_imagery_sources(text, str(root)), box)
+    native = native_gsd_m(imagery_sources(text, str(root)), box)
     steps = math.floor(region.gsd_m / native + 0.05)
     return NativeImagery(text, str(root), region.crs, region.gsd_m / steps) if steps > 1 else None
 
 
 @functools.lru_cache(maxsize=4)
-def _imagery_sources(source: str, root: str) -> list[Any]:
+def imagery_sources(source: str, root: str) -> list[Any]:
     """The adapters that settings of an imagery source describe, over local files below ``root``."""
     from brmgeo.ingest.imagery import GeoRaster, NgiiOrtho
     from brmgeo.ingest.tiles import MBTiles, TileFolder
@@ -374,7 +374,7 @@ def run_buildings(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     from brmgeo.export.cog import write_cog
 
     box, _ = read_lattice(inputs["lattice"])
-    windows = list(blocks(_shape(box), BLOCK_PX))
+    windows = list(blocks(shape_of(box), BLOCK_PX))
     work = functools.partial(building_block, inputs["footprints"], inputs["lattice"])
     built = known = 0
 
@@ -415,7 +415,7 @@ def run_ratio(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
 
     box, _ = read_lattice(inputs["lattice"])
     radii_m = tuple(settings["radii_m"])
-    windows = list(blocks(_shape(box), BLOCK_PX))
+    windows = list(blocks(shape_of(box), BLOCK_PX))
     work = functools.partial(ratio_block, inputs["footprints"], inputs["lattice"], radii_m)
     statistics = write_cog(
         out / "ratio.tif",
@@ -531,7 +531,7 @@ def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = Fals
             raise SettingsError(
                 f"region {region.name}: [generate] needs sheets, which the buildings are drawn on"
             )
-        bounds = _place(region)
+        bounds = place_of(region)
         generated = plan.add(
             SOURCE,
             {},
@@ -646,7 +646,7 @@ def find_sources(region: Region, source_dir: Path) -> list[SourceFile]:
         first = missing[0]
         places = " or ".join(own.paths)
         raise MissingInputError(
-            f"region {region.name}: {len(missing)} of {len(region.sheets)} sheets are missing: {_listed(missing, 12)}; "
+            f"region {region.name}: {len(missing)} of {len(region.sheets)} sheets are missing: {listed(missing, 12)}; "
             f"put files named like {first}.dxf into {source_dir} ({places}); get them from {where_to_get(first)}"
         )
     if not files:
@@ -735,14 +735,14 @@ def _imagery_inputs(
     else:
         assert given.level is not None
         source = TileFolder(path, grid_named(given.grid), given.level, given.template)
-    ensure_tiles(source, _place(region), region.crs, missing_ok=given.missing_share)
+    ensure_tiles(source, place_of(region), region.crs, missing_ok=given.missing_share)
     return {"imagery": path}, _imagery_settings(given)
 
 
 def _tile_range(region: Region, given: ImagerySettings) -> str:
     if given.kind != "tiles" or given.level is None:
         return ""
-    tiles = grid_named(given.grid).covering(_place(region), region.crs, given.level)
+    tiles = grid_named(given.grid).covering(place_of(region), region.crs, given.level)
     xs, ys = [t.x for t in tiles], [t.y for t in tiles]
     return f": {len(tiles)} tiles, x {min(xs)}-{max(xs)}, y {min(ys)}-{max(ys)}"
 
@@ -777,7 +777,7 @@ def _service_tiles(region: Region, given: ImagerySettings, source_dir: Path, fet
         missing_ok=given.missing_share,
     )
     with Progress().stage("imagery tiles") as bar:
-        ensure_tiles(service, _place(region), region.crs, progress=bar.update)
+        ensure_tiles(service, place_of(region), region.crs, progress=bar.update)
     return cache
 
 
@@ -805,13 +805,14 @@ def _beside(image: Path) -> list[Path]:
     )
 
 
-def _place(region: Region) -> Bounds:
-    return _bounds(region.bounds) if region.bounds is not None else _sheets_bounds(region)
+def place_of(region: Region) -> Bounds:
+    """(left, bottom, right, top) that a region covers: its bounds, else those of its sheets."""
+    return as_bounds(region.bounds) if region.bounds is not None else _sheets_bounds(region)
 
 
 def _sheets_bounds(region: Region) -> Bounds:
     extents = np.array([sheet_extent(s, region.crs) for s in region.sheets])
-    return _bounds([*extents[:, :2].min(axis=0), *extents[:, 2:].max(axis=0)])
+    return as_bounds([*extents[:, :2].min(axis=0), *extents[:, 2:].max(axis=0)])
 
 
 def credits(region: Region) -> str:
@@ -838,7 +839,7 @@ def build_maps(
 ) -> Path:
     """Builds what is missing of a region's maps in the store and publishes everything in ``out``."""
     progress = Progress()
-    _require_writable(out)
+    require_writable(out)
     store = Store(store_dir)
     with store.lock(region.name):
         plan = plan_maps(region, store, source_dir, fetch=True)
@@ -859,7 +860,7 @@ def build_maps(
     return out
 
 
-def _require_writable(out: Path) -> None:
+def require_writable(out: Path) -> None:
     """Raises WorkflowError at once rather than after all the work."""
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -926,7 +927,7 @@ def region_of_files(
     files = dict.fromkeys(p.absolute() for path in footprints for p in _files_of(path))
     name = out.absolute().name
     asked: dict[str, Any] = {
-        "name": _safe_name(name),
+        "name": safe_name(name),
         "title": name,
         "crs": crs.upper(),
         "gsd_m": gsd_m,
@@ -965,7 +966,8 @@ def _files_of(path: Path) -> list[Path]:
     return files
 
 
-def _safe_name(text: str) -> str:
+def safe_name(text: str) -> str:
+    """The text as the name of a region or folder: ASCII letters, digits, - and _."""
     name = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in text).strip("-_")
     return name[:64] or "region"
 
@@ -993,11 +995,13 @@ def _tags(out: Path, settings: Json) -> dict[str, str]:
     return output_tags(out.name, settings["region"], settings["attribution"], settings["terms"])
 
 
-def _shape(box: GeoBox) -> tuple[int, int]:
+def shape_of(box: GeoBox) -> tuple[int, int]:
+    """(rows, cols) of a lattice."""
     return int(box.shape[0]), int(box.shape[1])
 
 
-def _bounds(values: Any) -> Bounds:
+def as_bounds(values: Any) -> Bounds:
+    """Four values of a JSON file as (left, bottom, right, top)."""
     left, bottom, right, top = (float(v) for v in values)
     return (left, bottom, right, top)
 
@@ -1006,5 +1010,6 @@ def _rounded(values: Sequence[float]) -> tuple[float, ...]:
     return tuple(round(v, 1) for v in values)
 
 
-def _listed(names: Sequence[str], most: int = 4) -> str:
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """The first names, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

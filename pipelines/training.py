@@ -168,13 +168,13 @@ def run_survey(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     if not gsds:
         raise SettingsError(
             f"region {settings['region']}: its imagery has {native:.3g} m per pixel, much coarser than all of the "
-            f"training.gsd_m {maps._listed([f'{g:g}' for g in fine])}: give coarser ones, or finer imagery"
+            f"training.gsd_m {maps.listed([f'{g:g}' for g in fine])}: give coarser ones, or finer imagery"
         )
     grids = {g: _grid(box, g) for g in gsds}
     todo = [
         (g, first, windows[first : first + SURVEY_TILES])
         for g in gsds
-        for windows in [tile_windows(maps._shape(grids[g]), settings["tile_px"], settings["overlap_px"])]
+        for windows in [tile_windows(maps.shape_of(grids[g]), settings["tile_px"], settings["overlap_px"])]
         for first in range(0, len(windows), SURVEY_TILES)
     ]
     work = functools.partial(_survey_some, dict(inputs), json.dumps(settings))
@@ -221,11 +221,11 @@ def _grid(box: GeoBox, gsd_m: float) -> GeoBox:
 def _sources(inputs: Inputs, settings: Json) -> list[Any]:
     files = settings["source"]["files"]
     root = str(inputs[files[0]].parent if files else inputs["imagery"])
-    return maps._imagery_sources(json.dumps(settings["source"]), root)
+    return maps.imagery_sources(json.dumps(settings["source"]), root)
 
 
 def _splits(settings: Json) -> Splits:
-    bounds = maps._bounds(settings["bounds"])
+    bounds = maps.as_bounds(settings["bounds"])
     if settings["split"] != "blocks":
         return one_split(bounds, settings["split"])
     return spatial_splits(
@@ -518,7 +518,7 @@ def plan_tiles(
         "lattice": plan.steps["lattice"],
         "footprints": plan.steps["footprints"],
     }
-    box = lattice(maps._place(region), region.crs, region.gsd_m)
+    box = lattice(maps.place_of(region), region.crs, region.gsd_m)
     source = imagery.settings["source"]
     alignment = plan.add(ALIGNMENT, inputs, {"source": source, **ALIGN})
     if align:
@@ -539,7 +539,7 @@ def plan_tiles(
     )
     names: dict[str, str] = {}
     for gsd_m in own.gsd_m:
-        count = len(tile_windows(maps._shape(_grid(box, gsd_m)), own.tile_px, own.overlap_px))
+        count = len(tile_windows(maps.shape_of(_grid(box, gsd_m)), own.tile_px, own.overlap_px))
         for number, first in enumerate(range(0, count, own.shard_tiles)):
             name = f"{region.name}-{round(gsd_m * 1000):04d}-{number:03d}"
             plan.add(
@@ -609,7 +609,7 @@ def require_trainable(region: Region, data: Path) -> None:
     flown = flights_over(region.name, data)
     if flown:
         raise SettingsError(
-            f"region {region.name} is flown over by {maps._listed(flown)}, so it is never trained on: set training.hold_out "
+            f"region {region.name} is flown over by {maps.listed(flown)}, so it is never trained on: set training.hold_out "
             "= true in its region file to cut it for testing, or train on other regions"
         )
 
@@ -637,7 +637,7 @@ def held_ground(region: Region, data: Path) -> list[tuple[str, Bounds]]:
     found: list[tuple[str, Bounds]] = []
     if region.generate is not None or region.training.hold_out or region.training.split == "test":
         return found
-    own = shapely.box(*maps._place(region))
+    own = shapely.box(*maps.place_of(region))
     for path in sorted((data / "regions").glob("*.toml")):
         if path.stem.startswith("_") or path.stem == region.name:
             continue
@@ -649,10 +649,10 @@ def held_ground(region: Region, data: Path) -> list[tuple[str, Bounds]]:
             other.training.hold_out or other.training.split == "test" or flights_over(other.name, data)
         ):
             continue
-        place = transform_bounds(other.crs, region.crs, maps._place(other))
+        place = transform_bounds(other.crs, region.crs, maps.place_of(other))
         grown = shapely.box(*place).buffer(region.training.guard_m, join_style="mitre")
         if grown.intersects(own):
-            found.append((other.name, maps._bounds(grown.bounds)))
+            found.append((other.name, maps.as_bounds(grown.bounds)))
     return found
 
 
@@ -697,7 +697,7 @@ def _changed(settings: TrainingSettings, changes: Mapping[str, Any]) -> Training
 def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None, align: bool = False) -> Path:
     """Builds what is missing of a region's training tiles and publishes them in ``out``."""
     progress = Progress()
-    maps._require_writable(out)
+    maps.require_writable(out)
     store = Store(data / "work")
     with store.lock(region.name):
         plan, names = plan_tiles(region, store, data, fetch=True, align=align)
@@ -709,7 +709,7 @@ def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None,
     survey = made["tile-survey"].facts
     if survey["gsd_too_fine_m"]:
         progress.say(
-            f"{region.name}: nothing cut at {maps._listed([f'{g:g} m' for g in survey['gsd_too_fine_m']])}: much finer than "
+            f"{region.name}: nothing cut at {maps.listed([f'{g:g} m' for g in survey['gsd_too_fine_m']])}: much finer than "
             f"the imagery's {survey['imagery_gsd_m']:.3g} m per pixel"
         )
     offset = made["alignment"].facts
@@ -891,10 +891,10 @@ def cut_pairs(
     """
     if not 0.02 <= gsd_m <= 10:
         raise SettingsError(f"tiles --pairs: --gsd {gsd_m:g} is no size of a pixel in metres (0.02 to 10)")
-    safe = maps._safe_name(name)
+    safe = maps.safe_name(name)
     pairs = _paired(images, masks)
     progress = Progress()
-    maps._require_writable(out)
+    maps.require_writable(out)
     store = Store(out / ".brmgeo")
     with store.lock(safe):
         plan = Plan(store, safe)
@@ -966,9 +966,9 @@ def _paired(images: Path, masks: Path) -> list[tuple[str, str, str]]:
             f"tiles --pairs: {len(lonely)} pictures have no partner, such as {lonely[0]}, which {where} lacks; "
             "images and masks have the same names"
         )
-    safe = Counter(maps._safe_name(stem) for stem in pictures)
+    safe = Counter(maps.safe_name(stem) for stem in pictures)
     return [
         # Names that differ only in what a key cannot hold get a number.
-        (maps._safe_name(stem) + (f"-{i:05d}" if safe[maps._safe_name(stem)] > 1 else ""), name, labels[stem])
+        (maps.safe_name(stem) + (f"-{i:05d}" if safe[maps.safe_name(stem)] > 1 else ""), name, labels[stem])
         for i, (stem, name) in enumerate(sorted(pictures.items()))
     ]

@@ -61,7 +61,7 @@ _Count = NDArray[np.uint16] | NDArray[np.uint32]
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
-class _Disjoint(Compiler):
+class Disjoint(Compiler):
     """numba's compiler, told that the arrays of a function do not overlap.
 
     The compiler would else test at each call of ``_add_16`` whether any of its 20 rows overlap: a third of the time.
@@ -82,7 +82,7 @@ def _jit(function: _F) -> _F:
 def _jit_disjoint(function: _F) -> _F:
     """_jit for a function that reads nothing through one array that it writes through another."""
     return cast(
-        _F, numba.njit(cache=True, nogil=True, error_model="numpy", pipeline_class=_Disjoint)(function)
+        _F, numba.njit(cache=True, nogil=True, error_model="numpy", pipeline_class=Disjoint)(function)
     )
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from brmgeo.maps.ratio import _Disjoint
+from brmgeo.maps.ratio import Disjoint
 from brmgeo.match.settings import BeliefSettings
 from brmgeo.match.threads import split
 
@@ -33,7 +33,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=_Disjoint)
+@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=Disjoint)
 def _convolve(window, half, kx, ky, out):  # type: ignore[no-untyped-def]
     """out (256,) = a window of (15 + taps) x (15 + taps) cells, flat, through kx along rows, then ky; half is scratch.
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.flight.values import View
-from brmgeo.maps.ratio import _Disjoint
+from brmgeo.maps.ratio import Disjoint
 from brmgeo.match.belief import BLOCK
 from brmgeo.match.settings import RateSettings, RatioSettings
 from brmgeo.match.threads import split
@@ -217,7 +217,7 @@ def mask_templates(
     return np.float32(a_k) * k + np.float32(a_o) * w, np.float32(b_k) * k + np.float32(b_o) * w
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=_Disjoint)
+@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=Disjoint)
 def _correlate_blocks(cover, cols, first, template, low, high, heading, out, t0, t1):  # type: ignore[no-untyped-def]
     """Adds to out[t] (256,) the correlation of a cover with template[heading[t]] at the 16 x 16 cells of a block.
 
