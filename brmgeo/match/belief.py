@@ -526,8 +526,9 @@ class Belief:
     def search_tiers(self, tiers: Tiers, low: float, high: float, weight: float = 1.0) -> float:
         """As ``search``, at full resolution only where it may matter; returns the log of the evidence.
 
-        Full resolution have all listed blocks, and of the others the best ``FINE_SHARE`` by the coarse ratios. What else
-        stands out is listed with its coarse ratios: it is scored in full in the next frame. All other ground joins
+        Full resolution have the best blocks, listed or not, by belief and coarse ratios together (``FINE_SHARE`` of all).
+        Other listed blocks are weighed by their coarse ratios; so is what else stands out, which is listed with them: it
+        may be scored in full in the next frame. All other ground joins
         ``rest`` with the mass that its coarse ratios, or their upper bounds, give it: what is passed over by mistake is
         not lost, and while ``rest`` holds mass the next frame is searched anew.
 
@@ -556,21 +557,33 @@ class Belief:
         passed = float(count[0] @ bound.repeat(s, axis=0).repeat(s, axis=1) @ count[1]) * self.headings
         top, mass = top[:, : self.grid[0], : self.grid[1]], mass[:, : self.grid[0], : self.grid[1]]
 
-        even = self.rest / self.cells
-        keys = self._best(top, q)
-        llr = tiers.fine(keys)
-        blocks = _factor(llr, low, high, weight)
-        listed = len(self.keys)
-        blocks[:listed] *= self.blocks + np.float32(even)
-        blocks[listed:] *= np.float32(even)
+        even = np.float32(self.rest / self.cells)
+        chosen = self._best(top, tiers, float(even), high, weight)
+        row = self.index[chosen[:, 0], chosen[:, 1], chosen[:, 2]]
+        order = np.argsort(row < 0, kind="stable")
+        chosen, row = chosen[order], row[order]
+        listed = int(np.count_nonzero(row >= 0))
+        blocks = _factor(tiers.fine(chosen), low, high, weight)
+        blocks[:listed] *= self.blocks[row[:listed]] + even
+        blocks[listed:] *= even
+        other = np.ones(len(self.keys), np.bool_)
+        other[row[:listed]] = False
+        left = self.keys[other]
+        by_coarse = self._coarse_factor(tiers, left, low, high, weight)
+        by_coarse *= self.blocks[other] + even
+        keys, blocks = np.concatenate([chosen, left]), np.concatenate([blocks, by_coarse])
         self._clear_outside(keys, blocks)
         blocks[blocks < 1e-25] = 0.0
-        rough = np.repeat(mass * np.float32(even), q, axis=0)
+        rough = np.repeat(mass * even, q, axis=0)
         rough[keys[:, 0], keys[:, 1], keys[:, 2]] = 0.0
+        # What is passed over unlisted; listed blocks there are among ``blocks``.
+        gone = left[~scored[left[:, 1] // s, left[:, 2] // s]]
+        at = np.minimum(BLOCK, np.array(self.shape) - BLOCK * gone[:, 1:]).prod(axis=1)
+        passed -= float(at @ bound[gone[:, 1] // s, gone[:, 2] // s])
         total = (
             float(blocks.sum(dtype=np.float64))
             + float(rough.sum(dtype=np.float64))
-            + passed * even
+            + passed * float(even)
             + self.off
         )
 
@@ -583,35 +596,60 @@ class Belief:
             threshold = max(threshold, float(np.partition(both, -limit)[-limit]))
         stay = own > threshold
         more = np.argwhere(rough > threshold).astype(np.int32)
-        parts = [blocks[stay]]
-        if len(more):
-            places, inverse = np.unique(more // np.array([q, s, s], np.int32), axis=0, return_inverse=True)
-            factor = _factor(tiers.rough(places), low, high, weight) * np.float32(even)
-            cut = factor.reshape(len(places), s, side, s, side).transpose(0, 1, 3, 2, 4)
-            cut = cut[inverse.ravel(), more[:, 1] % s, more[:, 2] % s]
-            parts.append(np.ascontiguousarray(cut.repeat(s, axis=1).repeat(s, axis=2)))
-            self._clear_outside(more, parts[1])
-        self._list(np.concatenate([keys[stay], more]), np.concatenate(parts))
+        fresh = self._coarse_factor(tiers, more, low, high, weight) * even
+        self._clear_outside(more, fresh)
+        self._list(np.concatenate([keys[stay], more]), np.concatenate([blocks[stay], fresh]))
         self.rest = max(0.0, total - self.off - float(self.blocks.sum(dtype=np.float64)))
         self._normalise()
         self.prune()
         return math.log(total)
 
-    FINE_SHARE = 0.1
-    FINE_LEAST, FINE_MOST = 8_000, 80_000
+    def _coarse_factor(
+        self, tiers: Tiers, keys: NDArray[np.int32], low: float, high: float, weight: float
+    ) -> F32:
+        """(n, 16, 16) likelihood ratios of blocks (heading, row, col) by their coarse ratios, or by the bound of these
+        where there are none."""
+        q, s = tiers.group, tiers.scale
+        side = BLOCK // s
+        scored = np.zeros(tiers.bound.shape, np.bool_)
+        scored[tiers.places[:, 0], tiers.places[:, 1]] = True
+        row, col = keys[:, 1] // s, keys[:, 2] // s
+        has = scored[row, col]
+        out = np.empty((len(keys), BLOCK, BLOCK), np.float32)
+        out[~has] = _factor(tiers.bound[row, col][~has], low, high, weight)[:, None, None]
+        if has.any():
+            own = keys[has]
+            places, inverse = np.unique(own // np.array([q, s, s], np.int32), axis=0, return_inverse=True)
+            factor = _factor(tiers.rough(places), low, high, weight)
+            cut = factor.reshape(len(places), s, side, s, side).transpose(0, 1, 3, 2, 4)
+            cut = cut[inverse.ravel(), own[:, 1] % s, own[:, 2] % s]
+            out[has] = cut.repeat(s, axis=1).repeat(s, axis=2)
+        return out
 
-    def _best(self, top: F32, group: int) -> NDArray[np.int32]:
-        """Keys to score in full: the listed ones first, then the unlisted headings of the best (group, block)s."""
-        blocks = top.size * group
-        want = min(max(self.FINE_SHARE * blocks, self.FINE_LEAST), self.FINE_MOST, blocks)
-        flat = top.ravel()
-        best = np.argpartition(flat, -max(1, int(want) // group))[-max(1, int(want) // group) :]
-        best = best[np.isfinite(flat[best])]
-        g, row, col = np.unravel_index(np.sort(best), top.shape)
-        h = (g[:, None] * group + np.arange(group)).ravel()
-        keys = np.stack([h, row.repeat(group), col.repeat(group)], axis=1).astype(np.int32)
-        fresh = self.index[keys[:, 0], keys[:, 1], keys[:, 2]] < 0
-        return np.concatenate([self.keys, keys[fresh]])
+    FINE_SHARE = 0.03
+    FINE_LEAST, FINE_MOST = 2_000, 40_000
+
+    def _best(self, top: F32, tiers: Tiers, even: float, high: float, weight: float) -> NDArray[np.int32]:
+        """Keys to score in full: the best by their largest belief times their largest coarse likelihood ratio.
+
+        ``top`` (groups, block rows, block cols) holds the coarse ratios' maxima, -inf where there are none: of these
+        only listed blocks are taken, by their bounds.
+        """
+        q, s = tiers.group, tiers.scale
+        hope = np.repeat(np.minimum(top * np.float32(weight), np.float32(high)), q, axis=0)
+        hope += np.float32(math.log(max(even, 1e-30)))
+        if len(self.keys):
+            h, row, col = self.keys.T
+            ratio = np.where(
+                np.isfinite(top[h // q, row, col]), top[h // q, row, col], tiers.bound[row // s, col // s]
+            )
+            ratio = np.minimum(ratio * weight, high)
+            hope[h, row, col] = ratio + np.log(_mass_of(self.blocks)[:, 1] + max(even, 1e-30))
+        want = int(min(max(self.FINE_SHARE * hope.size, self.FINE_LEAST), self.FINE_MOST, hope.size))
+        flat = hope.ravel()
+        best = np.argpartition(flat, -want)[-want:]
+        best = np.sort(best[np.isfinite(flat[best])])
+        return np.stack(np.unravel_index(best, hope.shape), axis=1).astype(np.int32)
 
     def _clear_outside(self, keys: NDArray[np.int32], blocks: F32) -> None:
         """Zero in blocks what lies beyond the grid's last row and column."""

@@ -3,16 +3,19 @@
 **Mask.** For a pose, c is the building share of a map cell under a patch of the view, m its known share, k the
 mask's building share and w its known share. A mask pixel is building with P1 over a mapped building and P0
 elsewhere; under the background, that this view has nothing to do with this place, with the view's own rate pb.
-Per patch
+A hypothesis is a cell, not a point: which pixel of the map lies under a mask pixel is open by about the cell's size, so
+the mask pixel is building with p = P0 + (P1-P0) c/m. Per patch
 
-    llr = k [c log(P1/pb) + (m-c) log(P0/pb)] + (w-k) [c log((1-P1)/(1-pb)) + (m-c) log((1-P0)/(1-pb))] = c a + m b,
+    llr = k m log(p/pb) + (w-k) m log((1-p)/(1-pb)).
 
-so a heading costs one correlation of the building cover with ``a`` and, where ground is unknown, one of the
-known cover with ``b``. A whole map is searched in three tiers (``MaskScorer``): the ratio feature of a disc bounds
-what any heading can reach, cells twice as large and headings twice as wide rank what is left, and the best of
-these are scored at full resolution. Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings,
-so a patch counts as its area over the area that carries one independent observation. pb is kept within [P0,
-P1]: a blank view then says nothing in favour of any place, it only speaks against built-up ones.
+The logarithm of the mean, not the mean of the logarithms: a pose between the centres of cells and headings then keeps
+its evidence (docs/matchers.md has figures). With U = m log(p/(1-p)), V = m log(1-p) of the map a heading costs two
+correlations, of U with k and of V with w, and, where ground is unknown, one of m with the background's part. A whole
+map is searched in three tiers (``MaskTiers``): the ratio feature of a disc bounds what any heading can reach, cells
+twice as large and headings twice as wide rank what is left, and the best of these are scored at full resolution.
+Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings, so a patch counts as its area over
+the area that carries one independent observation. pb is kept within [P0, P1]: a blank view then says nothing in favour
+of any place, it only speaks against built-up ones.
 
 **Rings.** The ratios in n discs (eq. 1-3) are differenced into n rings, whose errors hardly depend on each
 other. A ring's share is expected at P0 + (P1-P0) G and scatters by missed and invented buildings, P(1-P) over
@@ -103,10 +106,15 @@ class Rates:
     false_alarm: float
     independent_m2: float
 
+    def background(self, rate: float) -> float:
+        """pb of a view of this ``rate``: kept within [P0, P1]."""
+        return min(max(rate, self.false_alarm), self.hit)
+
     def weights(self, rate: float) -> tuple[float, float, float, float]:
-        """Per square metre: (a of building, a of other, b of building, b of other) for a view of this ``rate``."""
+        """Of points, where c is 0 or 1: the ratio is c a + m b, these are, per square metre, (a of building, a of other,
+        b of building, b of other) for a view of this ``rate``."""
         p1, p0 = self.hit, self.false_alarm
-        pb = min(max(rate, p0), p1)
+        pb = self.background(rate)
         scale = 1.0 / self.independent_m2
         return (
             scale * math.log(p1 / p0),
@@ -146,7 +154,9 @@ class RateLearner:
         # A map and masks that hardly agree must not talk the filter into believing anything.
         hit = min(max(hit, 0.4), self._settings.hit)
         alarm = max(min(alarm, 0.5 * hit), self._settings.false_alarm)
-        self.rates = Rates(hit, alarm, unit)
+        # Rates are kept until they have moved: the map's logarithms are kept for them.
+        if abs(hit - self.rates.hit) > 0.02 or abs(math.log(alarm / self.rates.false_alarm)) > 0.1:
+            self.rates = Rates(hit, alarm, unit)
 
     def _prior(self, share: float) -> F64:
         return np.array([share, 1.0 - share]) * self.PRIOR
@@ -179,27 +189,46 @@ def _splat(forward, left, built, known, yaw, wanted, cell, reach, out_k, out_w, 
                         out_w[h, i, j] += w * known[n]
 
 
+@dataclass(frozen=True, slots=True)
+class MaskTemplates:
+    """A view laid onto cells, for each of some yaws of the body in the map (zeros for those not wanted).
+
+    Attributes:
+        built, seen: (yaws, 2 R + 1, 2 R + 1) float32, building and known area of the mask in units of the independent area.
+        background: the same shape, minus the log-likelihood under the background; it applies where the map is known.
+        rates: P1 and P0.
+    """
+
+    built: F32
+    seen: F32
+    background: F32
+    rates: Rates
+
+    @property
+    def reach(self) -> int:
+        """R, cells."""
+        return self.built.shape[1] // 2
+
+
 def mask_templates(
     points: ViewPoints, yaw_rad: F64, cell_m: float, rates: Rates, wanted: NDArray[np.bool_] | None = None
-) -> tuple[F32, F32]:
-    """Templates a and b of the mask's log-likelihood ratio, for each yaw of the body in the map (zeros where
-    not wanted).
+) -> MaskTemplates:
+    """The view on cells of ``cell_m``: the ratio at a cell is the sum over the template, its middle on the cell.
 
-    Returns two (yaws, 2 R + 1, 2 R + 1) float32: the ratio at a cell is the sum over the template of a times
-    the map's building share and b times its known share, the template's middle on the cell.
+    Areas are shared between the four nearest cell centres.
     """
     reach = math.ceil(points.reach_m / cell_m) + 1
     shape = (len(yaw_rad), 2 * reach + 1, 2 * reach + 1)
     k, w = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     if wanted is None:
         wanted = np.ones(len(yaw_rad), np.bool_)
-    shown = wanted
+    shown, unit = wanted, np.float32(1.0 / rates.independent_m2)
     split(
         lambda h0, h1: _splat(
             points.forward,
             points.left,
-            points.built,
-            points.known,
+            points.built * unit,
+            points.known * unit,
             yaw_rad,
             shown,
             cell_m,
@@ -212,9 +241,9 @@ def mask_templates(
         len(yaw_rad),
         8 if shown.sum() > 16 else len(yaw_rad),
     )
-    a_k, a_o, b_k, b_o = rates.weights(points.rate)
-    w -= k
-    return np.float32(a_k) * k + np.float32(a_o) * w, np.float32(b_k) * k + np.float32(b_o) * w
+    pb = rates.background(points.rate)
+    of_built, of_other = np.float32(-math.log(pb)), np.float32(-math.log(1 - pb))
+    return MaskTemplates(k, w, of_built * k + of_other * (w - k), rates)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=Disjoint)
@@ -235,6 +264,8 @@ def _correlate_blocks(cover, cols, first, template, low, high, heading, out, t0,
                 line = first[t] + (i + v) * cols
                 for u in range(low[h, v], high[h, v]):
                     w = template[h, v, u]
+                    if w == 0.0:
+                        continue
                     p = np.uint64(line + u)
                     for j in range(BLOCK):
                         k = np.uint64(j)
@@ -244,6 +275,21 @@ def _correlate_blocks(cover, cols, first, template, low, high, heading, out, t0,
                         acc[k + np.uint64(48)] += w * cover[p + c + c + c + k]
             for n in range(4 * BLOCK):
                 out[t, i * BLOCK + n] += acc[n]
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _log_covers(built, known, p0, gain, odds, other, i0, i1):  # type: ignore[no-untyped-def]
+    """odds = m log(p / (1 - p)), other = m log(1 - p) with p = p0 + gain * c / m of rows i0 to i1."""
+    empty_odds, empty_other = math.log(p0 / (1.0 - p0)), math.log(1.0 - p0)
+    for i in range(i0, i1):
+        for j in range(built.shape[1]):
+            m = known[i, j]
+            if built[i, j] <= 0.0:
+                odds[i, j], other[i, j] = m * empty_odds, m * empty_other
+            else:
+                p = p0 + gain * min(built[i, j] / m, 1.0)
+                rest = math.log(1.0 - p)
+                odds[i, j], other[i, j] = m * (math.log(p) - rest), m * rest
 
 
 class MapCover:
@@ -261,6 +307,7 @@ class MapCover:
         self._gaps = self._unknown_blocks(known)
         self._near_gap: tuple[int, NDArray[np.bool_]] | None = None
         self._most: tuple[int, F32] | None = None
+        self._evidence: tuple[Rates, int, F32, F32] | None = None
 
     @property
     def built(self) -> F32:
@@ -290,23 +337,40 @@ class MapCover:
             halves.append(total)
         return MapCover(halves[0], halves[1])
 
-    def score_blocks(self, keys: NDArray[np.int32], a: F32, b: F32) -> F32:
-        """Ratios at blocks: (n, 16, 16) float32 for keys (heading, block row, block col); a, b by heading.
+    def score_blocks(self, keys: NDArray[np.int32], templates: MaskTemplates) -> F32:
+        """Ratios at blocks: (n, 16, 16) float32 for keys (heading, block row, block col).
 
         Cells beyond the map get a ratio as well, of the ground that their view would show.
         """
         out = np.zeros((len(keys), BLOCK * BLOCK), np.float32)
         if len(keys):
-            reach = a.shape[1] // 2
+            reach = templates.reach
             self._widen(reach)
             near = self._near_unknown(reach)[keys[:, 1], keys[:, 2]]
-            # Where all ground in reach is known, the second correlation is the template's sum.
-            out[~near] = b.sum(axis=(1, 2))[keys[~near, 0], None]
-            self._correlate(0, keys, a, out)
+            # Where all ground in reach is known, the background's part is its template's sum.
+            out[~near] = templates.background.sum(axis=(1, 2))[keys[~near, 0], None]
+            odds, other = self._logs(templates.rates)
+            self._correlate(other, keys, templates.seen, out)
+            self._correlate(odds, keys, templates.built, out)
             some = np.zeros((int(near.sum()), BLOCK * BLOCK), np.float32)
-            self._correlate(1, keys[near], b, some)
+            self._correlate(self._covers[1], keys[near], templates.background, some)
             out[near] += some
         return out.reshape(-1, BLOCK, BLOCK)
+
+    def _logs(self, rates: Rates) -> tuple[F32, F32]:
+        """U and V of the module's docstring for cells with their margin, 0 where nothing is known; kept for these rates."""
+        if self._evidence is None or self._evidence[:2] != (rates, self._margin):
+            odds, other = (np.empty_like(self._covers[0]) for _ in (0, 1))
+            built, known = self._covers
+            split(
+                lambda i0, i1: _log_covers(
+                    built, known, rates.false_alarm, rates.hit - rates.false_alarm, odds, other, i0, i1
+                ),
+                len(built),
+                64,
+            )
+            self._evidence = (rates, self._margin, odds, other)
+        return self._evidence[2], self._evidence[3]
 
     def most_built(self, radius: int) -> F32:
         """(block rows, block cols) float32: the most building, in cells, that any cell of a block has within ``radius``
@@ -325,8 +389,8 @@ class MapCover:
             self._most = (radius, most)
         return self._most[1]
 
-    def _correlate(self, which: int, keys: NDArray[np.int32], template: F32, out: F32) -> None:
-        cover, margin, reach = self._covers[which], self._margin, template.shape[1] // 2
+    def _correlate(self, cover: F32, keys: NDArray[np.int32], template: F32, out: F32) -> None:
+        margin, reach = self._margin, template.shape[1] // 2
         cols = cover.shape[1]
         row, col = (keys[:, n].astype(np.int64) * BLOCK + margin - reach for n in (1, 2))
         filled = template != 0
@@ -374,20 +438,19 @@ class MapCover:
 def ceiling(points: ViewPoints, rates: Rates) -> tuple[F64, F64]:
     """The most that the mask's ratio can be over known ground with so much building in the view's reach.
 
-    The building may lie anywhere in reach: it is laid under the patches that gain most by it. So the bound needs
-    nothing but the ratio feature of a disc, holds for all headings, and no place above a limit can be missed by it.
+    The building may lie anywhere in reach: it is laid under the mask's own building, and evenly, where it gains most (the
+    ratio is concave in c). So the bound needs nothing but the ratio feature of a disc, holds for all headings, and no
+    place above a limit can be missed by it.
 
     Returns (n,) square metres of building, increasing from 0, and (n,) the ratio's upper bound there; beyond the last
     the bound stays.
     """
-    a_k, a_o, b_k, b_o = rates.weights(points.rate)
-    other = points.known - points.built
-    gain = (a_k * points.built + a_o * other).astype(np.float64)
-    base = float((b_k * points.built + b_o * other).sum(dtype=np.float64))
-    order = np.argsort(-gain / points.known)
-    order = order[gain[order] > 0]
-    area = np.concatenate([[0.0], np.cumsum(points.known[order], dtype=np.float64)])
-    return area, base + np.concatenate([[0.0], np.cumsum(gain[order])])
+    built, known = float(points.built.sum(dtype=np.float64)), points.area_m2
+    pb = rates.background(points.rate)
+    share = np.linspace(0.0, 1.0, 65)
+    p = rates.false_alarm + (rates.hit - rates.false_alarm) * share
+    other = (known - built) * math.log((1 - rates.false_alarm) / (1 - pb))
+    return share * built, (built * np.log(p / pb) + other) / rates.independent_m2
 
 
 class MaskTiers:
@@ -443,25 +506,23 @@ class MaskTiers:
     def rough(self, keys: NDArray[np.int32]) -> F32:
         """(n, 16, 16) ratios on coarse cells for keys (group of headings, coarse block row, coarse block col)."""
         if self._rough_body is None:
-            return self._coarse.score_blocks(keys, *self._rough)
+            return self._coarse.score_blocks(keys, self._rough)
         return _over_yaws(self._coarse, keys[:, 1:], self._rough, self._rough_body)
 
     def fine(self, keys: NDArray[np.int32]) -> F32:
         """(n, 16, 16) ratios for keys (heading, block row, block col)."""
         if self._body is None:
-            return self._cover.score_blocks(keys, *self._fine)
+            return self._cover.score_blocks(keys, self._fine)
         places, inverse = np.unique(keys[:, 1:], axis=0, return_inverse=True)
         return _over_yaws(self._cover, places, self._fine, self._body)[inverse.ravel()]
 
 
-def _over_yaws(
-    cover: MapCover, places: NDArray[np.int32], templates: tuple[F32, F32], log_weight: F64
-) -> F32:
+def _over_yaws(cover: MapCover, places: NDArray[np.int32], templates: MaskTemplates, log_weight: F64) -> F32:
     """(n, 16, 16) ratios at places (row, col of blocks), as the weighted mean of the likelihoods over yaws."""
     total = np.full((len(places), BLOCK, BLOCK), -np.inf, np.float32)
     for h in np.flatnonzero(log_weight > log_weight.max() - 15.0):
         keys = np.concatenate([np.full((len(places), 1), h), places], axis=1).astype(np.int32)
-        np.logaddexp(total, cover.score_blocks(keys, *templates) + np.float32(log_weight[h]), out=total)
+        np.logaddexp(total, cover.score_blocks(keys, templates) + np.float32(log_weight[h]), out=total)
     return total
 
 

@@ -80,7 +80,7 @@ class MaskMatcher(GridMatcher):
         wanted[self.belief.keys[:, 0]] = True
         yaw = self.belief.heading_of(np.arange(self.belief.headings)) + yaw_rad
         templates = mask_templates(self._points, yaw, self.cell_m, self._learner.rates, wanted)
-        return self._cover.score_blocks(self.belief.keys, *templates)
+        return self._cover.score_blocks(self.belief.keys, templates)
 
     def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
         sigma = math.sqrt(max(float(covariance[0, 0]), float(covariance[1, 1])))

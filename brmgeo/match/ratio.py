@@ -29,8 +29,8 @@ class RatioMatcher(GridMatcher):
     def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
         super().__init__(ground, settings)
         self._areas = DiscAreas(ground, self.cell_px)
-        r = settings.rates
-        self._rates = Rates(r.hit, r.false_alarm, settings.ratio.independent_m2)
+        r = settings.ratio
+        self._rates = Rates(r.hit, r.false_alarm, r.independent_m2)
         n, m = self.belief.grid
         self._every = np.stack(np.divmod(np.arange(n * m), m), axis=1).astype(np.int32)
         # Blocks that stand for the whole map where only few places are scored: the same ones in every frame.

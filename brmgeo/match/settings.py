@@ -19,6 +19,14 @@ def _check(owner: Any, **ranges: tuple[float, float]) -> None:
             )
 
 
+def _check_rates(owner: Any) -> None:
+    if owner.false_alarm >= owner.hit:
+        raise SettingsError(
+            f"{type(owner).__name__}.false_alarm = {owner.false_alarm} is not below hit = {owner.hit}: "
+            "swap or correct them"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class OdometrySettings:
     """How far odometry may be trusted; the same numbers serve belief, track and smoother.
@@ -90,9 +98,9 @@ class RateSettings:
     map still gains nothing (docs/matchers.md has the table).
     """
 
-    hit: float = 0.7
-    false_alarm: float = 0.04
-    independent_m2: float = 150.0
+    hit: float = 0.75
+    false_alarm: float = 0.03
+    independent_m2: float = 180.0
     llr_min: float = -8.0
     llr_max: float = 25.0
     repeat: float = 3.0
@@ -112,10 +120,7 @@ class RateSettings:
             systematic_sigma_m=(0, 100),
             least_fit=(0, 1),
         )
-        if self.false_alarm >= self.hit:
-            raise SettingsError(
-                f"RateSettings.false_alarm = {self.false_alarm} is not below hit = {self.hit}: swap or correct them"
-            )
+        _check_rates(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +189,7 @@ class RatioSettings:
             radius is off by half a step at most.
         noise: standard deviation of a ring's ratio that no rate explains, [0.001, 0.5].
         dof: degrees of freedom of the Student likelihood of one ring, [1, 100].
+        hit, false_alarm: as in ``RateSettings``.
         independent_m2: as in ``RateSettings``, for the scatter of a ring's ratio, square metres, [1, 1e5].
         repeat: as in ``RateSettings``, [0.1, 100].
         least_fit: the first fix needs two successive views whose rings hold the building that the map's rings hold (Dice
@@ -194,6 +200,8 @@ class RatioSettings:
     radius_step: float = 0.04
     noise: float = 0.012
     dof: float = 5.0
+    hit: float = 0.7
+    false_alarm: float = 0.04
     independent_m2: float = 300.0
     repeat: float = 5.0
     least_fit: float = 0.9
@@ -205,10 +213,13 @@ class RatioSettings:
             radius_step=(0.001, 0.2),
             noise=(0.001, 0.5),
             dof=(1, 100),
+            hit=(0.05, 0.999),
+            false_alarm=(0.0005, 0.9),
             independent_m2=(1, 1e5),
             repeat=(0.1, 100),
             least_fit=(0, 1),
         )
+        _check_rates(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,9 @@ import hashlib
 import json
 import math
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -61,6 +63,8 @@ class TrainSettings:
         checkpoint_steps: steps between checkpoints; one is also written at every epoch.
         threads: of torch; 0 leaves them as they are.
         device: ``cpu``, ``cuda``, or ``auto``: a GPU where there is one, in bfloat16.
+        compile: let torch.compile fuse the network's passes; a step then takes 0.7 times as long on one core, 0.9 times
+            on two, after half a minute of compiling. Needs a C++ compiler.
 
     Raises SettingsError for values that cannot be trained with.
     """
@@ -83,6 +87,7 @@ class TrainSettings:
     checkpoint_steps: int = 50
     threads: int = 0
     device: str = "auto"
+    compile: bool = False
 
     def __post_init__(self) -> None:
         whole = ("steps", "batch", "accumulate", "crop_px", "epoch_steps", "checkpoint_steps")
@@ -96,6 +101,11 @@ class TrainSettings:
             raise SettingsError(
                 f"training lr {self.lr}, ema {self.ema}, warmup_steps {self.warmup_steps}: lr lies in (0, 1), "
                 f"ema in [0, 1), the warm-up within the {self.steps} steps"
+            )
+        if self.compile and not shutil.which(os.environ.get("CXX", "g++")):
+            raise SettingsError(
+                "training compile = true: needs a C++ compiler, and there is no g++ here (CXX names another); install one, "
+                "or leave compile out"
             )
         if self.device not in ("auto", "cpu", "cuda"):
             raise SettingsError(f"training device {self.device!r}: give auto, cpu or cuda")
@@ -226,6 +236,9 @@ class Trainer:
         if settings.device == "cuda" and not gpu:
             raise SettingsError("training device cuda: there is no GPU that torch can use; leave it at auto")
         self.device = torch.device("cuda" if gpu else "cpu")
+        self._drawing: dict[tuple[int, int], Future[tuple[U8, U8]]] = {}
+        self._drawers = ThreadPoolExecutor(1, "crops")
+        self._forward: tuple[UNet, Callable[[Tensor], Tensor]] | None = None
 
     def start(self) -> Run:
         """The run of the checkpoint where there is one, otherwise a new one.
@@ -307,10 +320,10 @@ class Trainer:
         run.optimiser.zero_grad(set_to_none=True)
         total = 0.0
         for part in range(s.accumulate):
-            images, labels = batch_of(self._source, s.seed, run.step, part, s.batch, s.crop_px, self._augment)
+            images, labels = self._crops(run.step, part)
             x = torch.from_numpy(normalised(images)).to(self.device, memory_format=torch.channels_last)
             with self._precision():
-                logits = run.model(x)
+                logits = self._passes(run.model)(x)
             loss = loss_of(logits, torch.from_numpy(labels).to(self.device), s) / s.accumulate
             loss.backward()  # type: ignore[no-untyped-call]
             total += float(loss.detach())
@@ -327,6 +340,24 @@ class Trainer:
                     kept.copy_(new)
         run.losses.append(total)
         return total
+
+    def _crops(self, step: int, part: int) -> tuple[U8, U8]:
+        """The crops of one pass; those of the next one are drawn meanwhile, in a thread of their own."""
+        s = self._settings
+        after = (step, part + 1) if part + 1 < s.accumulate else (step + 1, 0)
+        for key in ((step, part), after):
+            if key not in self._drawing:
+                self._drawing[key] = self._drawers.submit(
+                    batch_of, self._source, s.seed, *key, s.batch, s.crop_px, self._augment
+                )
+        return self._drawing.pop((step, part)).result()
+
+    def _passes(self, model: UNet) -> Callable[[Tensor], Tensor]:
+        if not self._settings.compile:
+            return model
+        if self._forward is None or self._forward[0] is not model:
+            self._forward = (model, torch.compile(model))
+        return self._forward[1]
 
     def _precision(self) -> contextlib.AbstractContextManager[Any]:
         if self.device.type == "cuda":

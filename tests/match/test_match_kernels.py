@@ -138,8 +138,8 @@ def llr_by_definition(view_k, view_w, built, known, at, rate, rates) -> float:  
             continue
         k, w = view_k[oy + reach, ox + reach], view_w[oy + reach, ox + reach]
         c, m = built[i, j], known[i, j]
-        total += k * (c * math.log(p1 / pb) + (m - c) * math.log(p0 / pb))
-        total += (w - k) * (c * math.log((1 - p1) / (1 - pb)) + (m - c) * math.log((1 - p0) / (1 - pb)))
+        p = p0 + (p1 - p0) * c / m if m > 0 else p0
+        total += k * m * math.log(p / pb) + (w - k) * m * math.log((1 - p) / (1 - pb))
     return total / rates.independent_m2
 
 
@@ -149,10 +149,9 @@ def test_mask_ratio_equals_the_formula() -> None:
     points = view_points(view_at(scene, 1300, 5300, 0.7), cell / 2)
     built, known = cover_with_unknown(4)
     yaw = np.array([0.3, 2.5])
-    a, b = mask_templates(points, yaw, cell, RATES)
-    # The template of k alone: rates that make a = k.
-    reach = a.shape[1] // 2
-    view_k, view_w = np.zeros_like(a), np.zeros_like(a)
+    templates = mask_templates(points, yaw, cell, RATES)
+    reach = templates.reach
+    view_k, view_w = np.zeros_like(templates.built), np.zeros_like(templates.built)
     for h in range(2):
         for f, lft, k, w in zip(points.forward, points.left, points.built, points.known):
             x = (f * math.cos(yaw[h]) - lft * math.sin(yaw[h])) / cell + reach
@@ -164,7 +163,7 @@ def test_mask_ratio_equals_the_formula() -> None:
                 view_w[h, i + di, j + dj] += share * w
     cover = MapCover(built, known)
     keys = np.array([[0, 0, 1], [1, 1, 2], [1, 2, 3], [0, 2, 0]], np.int32)
-    listed = cover.score_blocks(keys, a, b)
+    listed = cover.score_blocks(keys, templates)
     rng = np.random.default_rng(5)
     for n, (h, by, bx) in enumerate(keys):
         for _ in range(12):
@@ -285,9 +284,9 @@ def test_yaws_unknown_are_averaged_over() -> None:
 
 def test_unknown_ground_and_unseen_pixels_say_nothing() -> None:
     points = view_points(view_at(town(1, 600.0, 150), 1300, 5300, 0.7), 2.5)
-    a, b = mask_templates(points, np.array([0.4]), 5.0, RATES)
+    templates = mask_templates(points, np.array([0.4]), 5.0, RATES)
     nothing = np.zeros((64, 64), np.float32)
-    score = MapCover(nothing, nothing).score_blocks(np.array([[0, 1, 1]], np.int32), a, b)
+    score = MapCover(nothing, nothing).score_blocks(np.array([[0, 1, 1]], np.int32), templates)
     assert np.array_equal(score, np.zeros_like(score))
 
 
@@ -297,9 +296,9 @@ def test_blank_view_speaks_for_no_place() -> None:
     built[:, :10] = 0
     points = view_points(view_at(town(1, 600.0, 1), 1300, 5300, 0.7), 2.5)
     assert points.rate == 0
-    a, b = mask_templates(points, np.array([0.4]), 5.0, RATES)
+    templates = mask_templates(points, np.array([0.4]), 5.0, RATES)
     inner = np.array([[0, 1, 1], [0, 1, 2], [0, 2, 1], [0, 2, 2]], np.int32)
-    score = MapCover(built, np.ones_like(built)).score_blocks(inner, a, b)
+    score = MapCover(built, np.ones_like(built)).score_blocks(inner, templates)
     assert score.max() <= 1e-3
     assert score[3, 0, 0] < -1
 
