@@ -19,6 +19,7 @@ from brmgeo.errors import BrmgeoError, SettingsError
 DATA = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=True, path_type=Path)
 METHODS = ("mask", "ratio", "paper")
+SEASONS = ("spring", "summer", "autumn", "winter")
 data_option = click.option(
     "--data",
     type=DATA,
@@ -375,7 +376,7 @@ def why(region: str, stage: str, data: Path) -> None:
 )
 @click.option(
     "--season",
-    type=click.Choice(["spring", "summer", "autumn", "winter"]),
+    type=click.Choice(SEASONS),
     help="Draw the frames of a generated REGION as it is on another day of this season: other light, crops and cars.",
 )
 @click.option("--no-odometry", is_flag=True, help="Fly without odometry.")
@@ -598,6 +599,16 @@ def localize(
 )
 @weights_option
 @click.option(
+    "--sift",
+    is_flag=True,
+    help="Also match each flight's frames to the imagery by SIFT, the paper's Fig. 1 (draws frames: slow).",
+)
+@click.option(
+    "--season",
+    type=click.Choice(SEASONS),
+    help="Draw the frames of a generated REGION as on another day of this season.",
+)
+@click.option(
     "--out", type=DATA, help="Where flights.csv and summary.md go (default data/out/REGION/evaluation)."
 )
 def evaluate(
@@ -614,6 +625,8 @@ def evaluate(
     hide: str | None,
     masks: str | None,
     weights: Path | None,
+    sift: bool,
+    season: str | None,
     out: Path | None,
 ) -> None:
     """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
@@ -638,14 +651,22 @@ def evaluate(
     chosen, kinds = (
         tuple(m.strip() for m in (text or "").split(",") if m.strip()) for text in (methods, masks)
     )
-    compared = None
-    if kinds:
-        compared = job.MaskComparison(kinds, weights, native_imagery(own, data) if region else None)
-    click.echo(
-        job.evaluate(
-            folder, own.flight, flights, first_seed, chosen, path, scale_bias, hide, out, scheduler, compared
-        )
-    )
+    compared = job.MaskComparison(kinds, weights) if kinds else None
+    if season is not None and (region is None or not (sift or "network" in kinds)):
+        raise SettingsError("evaluate --season: needs a generated REGION, and --sift or --masks network")
+    with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
+        drawn = job.Drawn()
+        if season is not None:
+            file = job.other_day(own, folder, season, first_seed, Path(scratch) / "other-day.tif")
+            drawn = job.Drawn(imagery=file, season=season)
+        elif region is not None and (kinds or sift):
+            drawn = job.Drawn(native=native_imagery(own, data))
+        click.echo(
+            job.evaluate(
+                folder, own.flight, flights, first_seed, chosen, path, scale_bias, hide, out, scheduler,
+                compared, sift, drawn,
+            )
+        )  # fmt: skip
 
 
 @cli.command()

@@ -9,7 +9,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,8 @@ from brmgeo.evaluate.figures import (
     shrinking_figure,
 )
 from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, render_report, verdict
-from brmgeo.evaluate.scores import Scores, dead_reckoning, score, travelled_m
+from brmgeo.evaluate.scores import FALSE_FIX_M, Scores, dead_reckoning, score, travelled_m
+from brmgeo.evaluate.sift import SiftFix, SiftMatcher
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
 from brmgeo.export.cog import box_of, read_overview, read_window
 from brmgeo.flight.folder import Flight, read_flight
@@ -553,31 +554,44 @@ def _background(path: Path) -> Background:
     return Background(pixels[0] if len(pixels) == 1 else np.moveaxis(pixels, 0, -1), bounds)
 
 
+@functools.lru_cache(maxsize=1)
+def _sift_matcher(imagery: Path, changed_ns: int) -> tuple[SiftMatcher, float]:
+    """Features of a region's imagery, and its metres per pixel."""
+    # The time of the last change is in the key, so that imagery made anew is read anew.
+    pixels, bounds = read_overview(imagery, 4000)
+    gsd_m = (bounds[2] - bounds[0]) / pixels.shape[2]
+    return SiftMatcher(np.moveaxis(pixels, 0, -1), bounds[0], bounds[3], gsd_m), gsd_m
+
+
+def sift_fixes(
+    imagery: Path, pictures: Iterable[NDArray[np.uint8]], level: Callable[[int, NDArray[Any], float], View]
+) -> Iterator[SiftFix | None]:
+    """The paper's Fig. 1: where SIFT finds each frame (h, w, 3) in a region's imagery, None where nowhere.
+
+    ``level(index, grey, gsd_m)`` makes a view of a frame's (h, w) float32 grey levels in [0, 1].
+    """
+    matcher, gsd_m = _sift_matcher(imagery, imagery.stat().st_mtime_ns)
+    for index, picture in enumerate(pictures):
+        view = level(index, picture.astype(np.float32).mean(axis=2) / 255.0, gsd_m)
+        yield matcher.locate((view.building * 255).astype(np.uint8), gsd_m, view.nadir_px)
+
+
 def sift_table(maps: Maps, flight: Flight, truth: FloatArray | None) -> ReportTable:
     """The paper's Fig. 1 as a table: SIFT features of each frame against the region's imagery."""
-    from brmgeo.evaluate.sift import SiftMatcher
-
     assert maps.imagery is not None
-    pixels, bounds = read_overview(maps.imagery, 4000)
-    gsd_m = (bounds[2] - bounds[0]) / pixels.shape[2]
-    matcher = SiftMatcher(np.moveaxis(pixels, 0, -1), bounds[0], bounds[3], gsd_m)
-    found = right = 0
-    for index, frame in enumerate(flight.frames):
-        grey = flight.image(index).astype(np.float32).mean(axis=2) / 255.0
-        view = make_view(
-            grey,
-            flight.camera,
-            flight.mount,
-            frame.roll_rad,
-            frame.pitch_rad,
-            frame.agl_m,
-            gsd_m,
-            t_s=frame.t_s,
+
+    def level(index: int, grey: NDArray[Any], gsd_m: float) -> View:
+        f = flight.frames[index]
+        return make_view(
+            grey, flight.camera, flight.mount, f.roll_rad, f.pitch_rad, f.agl_m, gsd_m, t_s=f.t_s
         )
-        fix = matcher.locate((view.building * 255).astype(np.uint8), gsd_m, view.nadir_px)
+
+    found = right = 0
+    pictures = (flight.image(index) for index in range(len(flight.frames)))
+    for index, fix in enumerate(sift_fixes(maps.imagery, pictures, level)):
         if fix is not None:
             found += 1
-            if truth is not None and np.linalg.norm(fix.xy - truth[index]) <= 50.0:
+            if truth is not None and np.linalg.norm(fix.xy - truth[index]) <= FALSE_FIX_M:
                 right += 1
     total = len(flight.frames)
     return ReportTable(
@@ -827,19 +841,28 @@ class MaskComparison:
         kinds: ``true`` (what a perfect network sees in the frame), ``network`` (on rendered frames), ``degraded`` (the true
             ones at the pixel accuracy of the paper's network), ``simulated`` (the simulator's own errors).
         weights: of the network; None for those that ship.
-        native: imagery finer than the maps', to render frames from.
     """
 
     kinds: tuple[str, ...]
     weights: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What the frames of simulated flights are drawn from: ``native``, imagery finer than the maps', or the picture in
+    the file ``imagery`` (another day's), or, without both, the maps' own imagery."""
+
     native: NativeImagery | None = None
+    imagery: Path | None = None
+    season: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """One simulated flight of an evaluation; ``hide`` hides half of the map under the flight.
 
-    ``masks`` flies it with several kinds of masks; None with the simulator's alone, without frames.
+    ``masks`` flies it with several kinds of masks; None with the simulator's alone, without frames. ``sift`` also
+    matches frames to the imagery.
     """
 
     maps_dir: Path
@@ -850,6 +873,8 @@ class Trial:
     scale_bias: float
     hide: str | None
     masks: MaskComparison | None = None
+    sift: bool = False
+    drawn: Drawn = Drawn()
 
 
 def fly_trial(trial: Trial) -> list[FlightRow]:
@@ -886,7 +911,87 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
                     first_frame_s=float(located.seconds[0]),
                 )
             )
+    if trial.sift:
+        began = time.monotonic()
+        estimates = _sift_estimates(trial, maps, ground, route, settings)
+        rows.append(
+            FlightRow(
+                flight=f"{_path_name(trial.path)}-{trial.seed}",
+                seed=trial.seed,
+                method="SIFT",
+                scores=score(estimates, None, flown.motions, truth),
+                seconds_per_frame=(time.monotonic() - began) / len(estimates),
+                first_frame_s=math.nan,
+            )
+        )
     return rows
+
+
+def _sift_estimates(
+    trial: Trial, maps: Maps, ground: Any, route: FloatArray, settings: Any
+) -> list[Estimate]:
+    """What SIFT alone says of each frame of a trial: a fix where RANSAC accepts one, else nothing."""
+    from brmgeo.synth.flight import Simulator, fly
+
+    assert maps.imagery is not None
+    course = fly(route, settings, trial.seed)
+    simulator = Simulator(ground, settings, course, trial.seed)
+    left, bottom, right, top = maps.bounds
+    middle = np.array([(left + right) / 2, (bottom + top) / 2])
+    out: list[Estimate] = []
+    for i, fix in enumerate(
+        sift_fixes(
+            maps.imagery,
+            _pictures(trial, maps, route, settings, simulator),
+            lambda i, grey, gsd_m: _measured_view(settings, course, i, grey, 0.0, gsd_m),
+        )
+    ):
+        # The features' own spread; no view of one frame alone knows more.
+        sigma_m = 2.0 if fix is not None else math.hypot(right - left, top - bottom) / math.sqrt(12.0)
+        out.append(
+            Estimate(
+                t_s=float(course.frame_times_s[i]),
+                status="lost" if fix is None else "converged",
+                mean=middle if fix is None else fix.xy,
+                covariance=np.eye(2) * sigma_m**2,
+                yaw_rad=math.nan,
+                yaw_sigma_rad=math.nan,
+                mass=0.0 if fix is None else 1.0,
+                candidates=np.empty((0, 2)),
+                candidate_mass=np.empty(0),
+                candidate_count=0,
+            )
+        )
+    return out
+
+
+def _pictures(
+    trial: Trial, maps: Maps, route: FloatArray, settings: Any, simulator: Any
+) -> Iterator[NDArray[np.uint8]]:
+    """The frames of a trial, as a camera would have stored them."""
+    drawn = trial.drawn
+    native = drawn.native if drawn.imagery is None else None
+    imagery = _imagery_of(
+        trial.own, route, native, drawn.imagery or maps.imagery or maps.folder / "imagery.tif"
+    )
+    for i in range(len(simulator.course.frame_index)):
+        yield photographed(simulator.picture(i, imagery), settings.jpeg_quality)
+
+
+def _measured_view(
+    settings: Any, course: Any, i: int, image: NDArray[Any], roof_m: float, gsd_m: float
+) -> View:
+    """A frame's picture or mask, levelled by what the aircraft measured, laid onto the plane at ``roof_m``."""
+    return make_view(
+        image,
+        settings.camera,
+        settings.mount,
+        math.radians(course.measured_roll_deg[i]),
+        math.radians(course.measured_pitch_deg[i]),
+        above_roofs_m(float(course.measured_agl_m[i]), roof_m),
+        gsd_m,
+        t_s=float(course.frame_times_s[i]),
+    )
 
 
 def _views_by_masks(
@@ -912,10 +1017,9 @@ def _views_by_masks(
             seen[kind] = simulated
             continue
         if kind == "network":
-            imagery = _imagery_of(trial.own, route, masks.native, maps.imagery or maps.folder / "imagery.tif")
             images = (
                 network_mask(
-                    photographed(simulator.picture(i, imagery), settings.jpeg_quality),
+                    picture,
                     slant_gsd_m(
                         settings.camera,
                         settings.mount,
@@ -925,22 +1029,13 @@ def _views_by_masks(
                     ),
                     masks.weights,
                 )
-                for i in frames
+                for i, picture in enumerate(_pictures(trial, maps, route, settings, simulator))
             )
         else:
             images = (simulator.mask(i, relief=True) for i in frames)
         # All of them show roofs where the camera sees them, so all are laid onto the same plane.
         seen[kind] = [
-            make_view(
-                image,
-                settings.camera,
-                settings.mount,
-                math.radians(course.measured_roll_deg[i]),
-                math.radians(course.measured_pitch_deg[i]),
-                above_roofs_m(float(course.measured_agl_m[i]), ROOF_M),
-                maps.ground.gsd_m,
-                t_s=float(course.frame_times_s[i]),
-            )
+            _measured_view(settings, course, i, image, ROOF_M, maps.ground.gsd_m)
             for i, image in zip(frames, images)
         ]
     return seen
@@ -988,10 +1083,13 @@ def evaluate(
     out: Path,
     scheduler_spec: str | None,
     masks: MaskComparison | None = None,
+    sift: bool = False,
+    drawn: Drawn = Drawn(),
 ) -> str:
     """Flies many simulated flights, writes flights.csv (as they land), summary.md and returns the table as text.
 
-    With ``masks`` each flight is flown with several kinds of masks.
+    With ``masks`` each flight is flown with several kinds of masks; with ``sift`` its frames are also matched to the
+    imagery. Frames are drawn from ``drawn``.
 
     WorkflowError, after all is written, where a flight broke off.
     """
@@ -1004,23 +1102,33 @@ def evaluate(
         if kind not in MASKS:
             raise SettingsError(f"--masks: {kind!r} is not known: choose among {', '.join(MASKS)}")
     maps = read_maps(maps_dir.absolute())
-    drawn = "12 % of buildings missed, 3 false blobs a frame, wobbly edges"
-    shown = f"masks: {drawn}"
+    usual = "12 % of buildings missed, 3 false blobs a frame, wobbly edges"
+    shown = f"masks: {usual}"
     if masks is not None:
         told = {
             "true": "what a perfect network would see in the frame",
             "degraded": f"true ones with pixels flipped in patches to an accuracy of {PAPER_ACCURACY}",
-            "simulated": drawn,
+            "simulated": usual,
         }
         if "network" in masks.kinds:
-            if maps.imagery is None and masks.native is None:
+            if maps.imagery is None and drawn.native is None:
                 raise MissingInputError(
                     f"{maps.folder / 'imagery.tif'} is not there; the network's frames are drawn from imagery"
                 )
             told["network"] = f"{network_name(masks.weights)} on rendered frames"
         shown = "masks: " + "; ".join(f"{kind}: {told[kind]}" for kind in masks.kinds)
+    if sift:
+        if maps.imagery is None:
+            raise MissingInputError(
+                f"{maps.folder / 'imagery.tif'} is not there; --sift matches frames to imagery: leave it out"
+            )
+        shown += "; SIFT: each frame for itself against the imagery, " + (
+            f"drawn as on another day ({drawn.season})"
+            if drawn.season
+            else "drawn from this very imagery, which is far easier than a real camera (--season draws another day's)"
+        )
     trials = [
-        Trial(maps.folder, own, seed, methods, path, scale_bias, hide, masks)
+        Trial(maps.folder, own, seed, methods, path, scale_bias, hide, masks, sift, drawn)
         for seed in range(first_seed, first_seed + flights)
     ]
     progress = Progress()

@@ -207,7 +207,7 @@ class MaskTemplates:
     @property
     def reach(self) -> int:
         """R, cells."""
-        return self.built.shape[1] // 2
+        return int(self.built.shape[1]) // 2
 
 
 def mask_templates(

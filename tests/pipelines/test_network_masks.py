@@ -285,6 +285,22 @@ def test_the_same_flights_with_several_kinds_of_masks(
     assert "'perfect' is not known" in say(*words, "--masks", "perfect").line
 
 
+def test_sift_is_compared_on_the_same_flights(maps: Path, waypoints: Path, tmp_path: Path, say: Say) -> None:
+    words = ("evaluate", "--maps", maps, "--out", tmp_path, "--flights", 1, "--path", waypoints)
+    said = say(*words, "--methods", "mask", "--sift")
+    assert said.code == 0, said.err
+    rows = {r["method"]: r for r in csv.DictReader((tmp_path / "flights.csv").read_text().splitlines())}
+    assert set(rows) == {"mask", "SIFT"}
+    assert rows["SIFT"]["odometry_rmse_m"] == rows["mask"]["odometry_rmse_m"]
+    assert rows["SIFT"]["frames"] == rows["mask"]["frames"]
+    # Frames drawn from the very imagery that they are matched to: the easiest case there is.
+    assert float(rows["SIFT"]["share_converged"]) > 0
+    assert float(rows["SIFT"]["median_after_first_fix_m"]) < 10
+    text = (tmp_path / "summary.md").read_text()
+    assert "easier than a real camera" in text
+    assert "needs a generated REGION" in say(*words, "--sift", "--season", "winter").line
+
+
 # ---------------------------------------------------------------- folders of images
 
 
