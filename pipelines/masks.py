@@ -61,6 +61,8 @@ IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 SIGN = "masks.json"
 _FORMAT = 1  # of the cache's files and key
 _BLOCK_PX = 512
+#: Frames that go through the network together, and the pixels after which no further one is added.
+_BATCH, _BATCH_PX = 4, 4_000_000
 
 
 # --- frames of a flight ------------------------------------------------------------------------------------------
@@ -241,16 +243,27 @@ def frame_picture(flight: Flight, index: int) -> tuple[Picture, bytes]:
 def _ask(flight: Flight, segmenter: Segmenter, cache: Path, progress: Progress) -> tuple[Path, ...]:
     """The file of each frame's probability, after the network has answered for those that are not there yet."""
     files: list[Path] = []
+    waiting: list[tuple[Path, Picture, float]] = []
     asked = 0
+
+    def answer() -> None:
+        said = segmenter.probabilities([p for _, p, _ in waiting], [g for _, _, g in waiting])
+        for (path, _, _), probability in zip(waiting, said, strict=True):
+            _write_png(path, _stored(probability))
+        waiting.clear()
+
     with progress.stage(f"{flight.name} masks") as bar:
         for index in range(len(flight.frames)):
             picture, data = frame_picture(flight, index)
             gsd_m = frame_gsd_m(flight, index)
             path = cache / _key(data, segmenter, picture, gsd_m)
             if _read_stored(path) is None:
-                _write_png(path, _stored(segmenter.probability(picture, gsd_m)))
+                waiting.append((path, picture, gsd_m))
                 asked += 1
             files.append(path)
+            pixels = sum(p.rgb.shape[0] * p.rgb.shape[1] for _, p, _ in waiting)
+            if len(waiting) == _BATCH or pixels > _BATCH_PX or index + 1 == len(flight.frames):
+                answer()
             bar.update(index + 1, len(flight.frames))
     kept = len(files) - asked
     if kept:
