@@ -576,8 +576,8 @@ class Belief:
         blocks[blocks < 1e-25] = 0.0
         rough = np.repeat(mass * even, q, axis=0)
         rough[keys[:, 0], keys[:, 1], keys[:, 2]] = 0.0
-        # What is passed over unlisted; listed blocks there are among ``blocks``.
-        gone = left[~scored[left[:, 1] // s, left[:, 2] // s]]
+        # Listed blocks on ground that is passed over are among ``blocks``.
+        gone = keys[~scored[keys[:, 1] // s, keys[:, 2] // s]]
         at = np.minimum(BLOCK, np.array(self.shape) - BLOCK * gone[:, 1:]).prod(axis=1)
         passed -= float(at @ bound[gone[:, 1] // s, gone[:, 2] // s])
         total = (
