@@ -241,13 +241,14 @@ def test_camera_turned_in_its_mount_is_found() -> None:
     assert math.degrees(result.boresight_sigma_rad[2]) < 0.4
 
 
-@pytest.mark.parametrize("delay_s", [0.05, -0.4, 0.9])
-def test_delay_is_found(delay_s: float) -> None:
+# The larger the delay, the more is lost before it is known.
+@pytest.mark.parametrize(("delay_s", "most_m"), [(0.05, 0.5), (-0.4, 2.5), (0.9, 3.0)])
+def test_delay_is_found(delay_s: float, most_m: float) -> None:
     course, imu = _flown()
     result, error = _estimate(course, replace(imu, t_s=imu.t_s + delay_s))
     assert abs(result.delay_s - delay_s) < 0.012
     assert result.delay_sigma_s < 0.01
-    assert np.hypot(*error.T).max() < 3.0
+    assert np.hypot(*error.T).max() < most_m
 
 
 def test_too_little_is_refused() -> None:
