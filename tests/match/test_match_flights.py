@@ -274,7 +274,7 @@ def test_work_follows_the_area_still_possible(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(
         MapCover,
         "score_blocks",
-        lambda self, keys, a, b: (scored.append(len(keys)), score(self, keys, a, b))[1],
+        lambda self, keys, t: (scored.append(len(keys)), score(self, keys, t))[1],
     )
     f = flight(missed=0.05)
     matcher = make_matcher("mask", ground, QUICK)
