@@ -207,7 +207,18 @@ def test_steps_err_as_much_as_is_said_of_them() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("heights_m", [(3.0, 6.0, 9.0), (3.0, 9.0, 40.0)])
+@pytest.mark.parametrize(
+    "heights_m",
+    [
+        (3.0, 6.0, 9.0),
+        pytest.param(
+            (3.0, 9.0, 40.0),
+            marks=pytest.mark.xfail(
+                strict=True, reason="0.17: sigma too careful on short flights over towers"
+            ),
+        ),
+    ],
+)
 def test_steps_over_buildings_err_as_much_as_is_said_of_them(heights_m: tuple[float, ...]) -> None:
     rng = np.random.default_rng(8)
     boxes = [shapely.box(x, y, x + 14.0, y + 11.0) for x, y in rng.uniform(-160, 160, (260, 2))]
@@ -227,8 +238,7 @@ def test_steps_over_buildings_err_as_much_as_is_said_of_them(heights_m: tuple[fl
         agl = course.xyz_m[course.frame_index, 2]
         result = run_vio(course.frame_times_s, frames, agl, imu, CAMERA, MOUNT)
         squared.append(_squared_misses(result, course))
-    # Measured: 0.17 with towers. Over whole flights (docs/odometry.md) 0.8; these are short and without noise.
-    assert 0.1 < np.concatenate(squared).mean() < 2.5
+    assert 0.2 < np.concatenate(squared).mean() < 2.5
 
 
 def test_camera_turned_in_its_mount_is_found() -> None:

@@ -158,14 +158,19 @@ def test_two_identical_districts_stay_ambiguous() -> None:
 
 
 @pytest.mark.parametrize(("method", "seed"), [("mask", 98), ("mask", 99), ("ratio", 99)])
-def test_a_wrong_map_is_told_and_never_gives_a_place(method: str, seed: int) -> None:
+def test_a_wrong_map_never_gives_a_place(method: str, seed: int) -> None:
     f = flight(town(seed))
-    estimates = run(make_matcher(method, GROUND, QUICK), f)
-    assert all(e.position is None for e in estimates)
-    if method == "mask":
-        # A random town of equal houses has corners that look like another's: then, for a while, it is ambiguous.
-        assert sum(e.status == "lost" for e in estimates) >= 5
-        assert estimates[-1].extra["off_map"] > 0.8
+    assert all(e.position is None for e in run(make_matcher(method, GROUND, QUICK), f))
+
+
+RESEMBLES = pytest.mark.xfail(strict=True, reason="resembles for a while: ends ambiguous, 0.86 off the map")
+
+
+@pytest.mark.parametrize("seed", [98, pytest.param(99, marks=RESEMBLES)])
+def test_wrong_map_ends_lost(seed: int) -> None:
+    estimates = run(make_matcher("mask", GROUND, QUICK), flight(town(seed)))
+    assert estimates[-1].status == "lost"
+    assert estimates[-1].extra["off_map"] > 0.9
 
 
 @pytest.mark.slow
