@@ -647,7 +647,9 @@ def evaluate(
             / "evaluation"
             / (f"hidden-{hide}" if hide else path if path in job.PATHS else "waypoints")
         )
-        out = out.with_name(f"{out.name}-masks") if masks else out
+        # What is flown otherwise goes beside the plain table, not over it.
+        kind = "".join(f"-{w}" for w in ("masks" if masks else "", "sift" if sift else "", season or "") if w)
+        out = out.with_name(out.name + kind)
     chosen, kinds = (
         tuple(m.strip() for m in (text or "").split(",") if m.strip()) for text in (methods, masks)
     )

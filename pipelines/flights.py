@@ -565,15 +565,18 @@ def _sift_matcher(imagery: Path, changed_ns: int) -> tuple[SiftMatcher, float]:
 
 def sift_fixes(
     imagery: Path, pictures: Iterable[NDArray[np.uint8]], level: Callable[[int, NDArray[Any], float], View]
-) -> Iterator[SiftFix | None]:
-    """The paper's Fig. 1: where SIFT finds each frame (h, w, 3) in a region's imagery, None where nowhere.
+) -> Iterator[tuple[SiftFix | None, float]]:
+    """The paper's Fig. 1: where SIFT finds each frame (h, w, 3) in a region's imagery, None where nowhere; and the seconds
+    that finding it took, of the levelled frame as the matchers' are.
 
     ``level(index, grey, gsd_m)`` makes a view of a frame's (h, w) float32 grey levels in [0, 1].
     """
     matcher, gsd_m = _sift_matcher(imagery, imagery.stat().st_mtime_ns)
     for index, picture in enumerate(pictures):
         view = level(index, picture.astype(np.float32).mean(axis=2) / 255.0, gsd_m)
-        yield matcher.locate((view.building * 255).astype(np.uint8), gsd_m, view.nadir_px)
+        began = time.perf_counter()
+        fix = matcher.locate((view.building * 255).astype(np.uint8), gsd_m, view.nadir_px)
+        yield fix, time.perf_counter() - began
 
 
 def sift_table(maps: Maps, flight: Flight, truth: FloatArray | None) -> ReportTable:
@@ -588,7 +591,7 @@ def sift_table(maps: Maps, flight: Flight, truth: FloatArray | None) -> ReportTa
 
     found = right = 0
     pictures = (flight.image(index) for index in range(len(flight.frames)))
-    for index, fix in enumerate(sift_fixes(maps.imagery, pictures, level)):
+    for index, (fix, _) in enumerate(sift_fixes(maps.imagery, pictures, level)):
         if fix is not None:
             found += 1
             if truth is not None and np.linalg.norm(fix.xy - truth[index]) <= FALSE_FIX_M:
@@ -912,16 +915,17 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
                 )
             )
     if trial.sift:
-        began = time.monotonic()
-        estimates = _sift_estimates(trial, maps, ground, route, settings)
+        estimates, seconds = _sift_estimates(trial, maps, ground, route, settings)
+        # SIFT states no covariance of its own, so what lies within its sigma says nothing.
+        scores = replace(score(estimates, None, flown.motions, truth), within_sigma=None)
         rows.append(
             FlightRow(
                 flight=f"{_path_name(trial.path)}-{trial.seed}",
                 seed=trial.seed,
                 method="SIFT",
-                scores=score(estimates, None, flown.motions, truth),
-                seconds_per_frame=(time.monotonic() - began) / len(estimates),
-                first_frame_s=math.nan,
+                scores=scores,
+                seconds_per_frame=float(np.mean(seconds)),
+                first_frame_s=seconds[0],
             )
         )
     return rows
@@ -929,8 +933,8 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
 
 def _sift_estimates(
     trial: Trial, maps: Maps, ground: Any, route: FloatArray, settings: Any
-) -> list[Estimate]:
-    """What SIFT alone says of each frame of a trial: a fix where RANSAC accepts one, else nothing."""
+) -> tuple[list[Estimate], list[float]]:
+    """What SIFT alone says of each frame of a trial, and its seconds: a fix where RANSAC accepts one, else nothing."""
     from brmgeo.synth.flight import Simulator, fly
 
     assert maps.imagery is not None
@@ -939,14 +943,16 @@ def _sift_estimates(
     left, bottom, right, top = maps.bounds
     middle = np.array([(left + right) / 2, (bottom + top) / 2])
     out: list[Estimate] = []
-    for i, fix in enumerate(
+    seconds: list[float] = []
+    for i, (fix, took) in enumerate(
         sift_fixes(
             maps.imagery,
             _pictures(trial, maps, route, settings, simulator),
             lambda i, grey, gsd_m: _measured_view(settings, course, i, grey, 0.0, gsd_m),
         )
     ):
-        # The features' own spread; no view of one frame alone knows more.
+        seconds.append(took)
+        # Assumed, for the estimate's form: a fix to two metres; without one, anywhere.
         sigma_m = 2.0 if fix is not None else math.hypot(right - left, top - bottom) / math.sqrt(12.0)
         out.append(
             Estimate(
@@ -962,7 +968,7 @@ def _sift_estimates(
                 candidate_count=0,
             )
         )
-    return out
+    return out, seconds
 
 
 def _pictures(
@@ -1096,8 +1102,12 @@ def evaluate(
     for method in methods:
         if method not in METHODS:
             raise SettingsError(f"method {method!r} is not known: choose among {', '.join(METHODS)}")
+    if not methods and not sift:
+        raise SettingsError(f"--methods: names none; give some of {', '.join(METHODS)}")
     if flights < 1:
         raise SettingsError(f"--flights {flights}: give 1 or more")
+    if sift and hide is not None:
+        raise SettingsError("--sift matches the imagery, which --hide does not hide: leave out one of them")
     for kind in masks.kinds if masks is not None else ():
         if kind not in MASKS:
             raise SettingsError(f"--masks: {kind!r} is not known: choose among {', '.join(MASKS)}")
@@ -1111,11 +1121,12 @@ def evaluate(
             "simulated": usual,
         }
         if "network" in masks.kinds:
-            if maps.imagery is None and drawn.native is None:
+            if maps.imagery is None and drawn.native is None and drawn.imagery is None:
                 raise MissingInputError(
                     f"{maps.folder / 'imagery.tif'} is not there; the network's frames are drawn from imagery"
                 )
-            told["network"] = f"{network_name(masks.weights)} on rendered frames"
+            day = f" of another day ({drawn.season})" if drawn.season else ""
+            told["network"] = f"{network_name(masks.weights)} on rendered frames{day}"
         shown = "masks: " + "; ".join(f"{kind}: {told[kind]}" for kind in masks.kinds)
     if sift:
         if maps.imagery is None:
@@ -1149,8 +1160,9 @@ def evaluate(
     if not rows:
         raise WorkflowError(f"evaluate: none of {flights} flights could be flown; {broken[0]}")
     where = "over ground that the map does not show" if hide else "over built-up ground"
+    frameless = "masks-only " if masks is None and not sift else ""
     note = (
-        f"{flights - len(broken)} simulated {'masks-only ' if masks is None else ''}flights ({_path_name(path)}, seeds "
+        f"{flights - len(broken)} simulated {frameless}flights ({_path_name(path)}, seeds "
         f"{first_seed} to {first_seed + flights - 1}) {where} of {maps.folder.name}; "
         f"odometry: simulated, scale bias {scale_bias:+.0%} or the opposite, heading drift 0.75 deg per root minute; "
         f"{shown}. Nothing is aligned before it is scored."

@@ -168,16 +168,22 @@ def _segmenter(weights: Path | None, threads: int | None) -> Segmenter:
 
 def trained_over(card: ModelCard, region: str) -> str:
     """What is to be said where a network was trained on the region that it is used over; empty where it was not."""
-    sources = card.data.get("sources", []) if isinstance(card.data, dict) else []
-    named = {
-        name
-        for source in (sources if isinstance(sources, list) else [])
-        if isinstance(source, dict) and source.get("split") != "test"
-        for name in source.get("regions", ())
-    }
+    named = set(_trained_regions(card.data))
     if region not in named:
         return ""
     return f"the network was trained on region {region}, so results over it look better than elsewhere"
+
+
+def _trained_regions(data: Any) -> Iterator[str]:
+    """Regions among the sources of a card's data that were not for tests, and of the weights that it went on from."""
+    sources = data.get("sources") if isinstance(data, dict) else None
+    for source in sources if isinstance(sources, list) else ():
+        if isinstance(source, dict) and source.get("split") != "test":
+            regions = source.get("regions")
+            yield from (
+                r for r in (regions if isinstance(regions, list | tuple) else ()) if isinstance(r, str)
+            )
+            yield from _trained_regions(source.get("data"))
 
 
 def network_warning(weights: Path | None, region: str) -> str:

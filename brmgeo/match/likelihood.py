@@ -111,7 +111,8 @@ class Rates:
         return min(max(rate, self.false_alarm), self.hit)
 
     def weights(self, rate: float) -> tuple[float, float, float, float]:
-        """Of points, where c is 0 or 1: the ratio is c a + m b, these are, per square metre, (a of building, a of other,
+        """Of points: the ratio is c a + m b, which is exact where c is 0 or 1 (between them it is the mean of two
+        logarithms, never above the logarithm of the mean); these are, per square metre, (a of building, a of other,
         b of building, b of other) for a view of this ``rate``."""
         p1, p0 = self.hit, self.false_alarm
         pb = self.background(rate)
@@ -360,8 +361,11 @@ class MapCover:
     def _logs(self, rates: Rates) -> tuple[F32, F32]:
         """U and V of the module's docstring for cells with their margin, 0 where nothing is known; kept for these rates."""
         if self._evidence is None or self._evidence[:2] != (rates, self._margin):
-            odds, other = (np.empty_like(self._covers[0]) for _ in (0, 1))
             built, known = self._covers
+            # Rates that are learned change often, the map's size does not.
+            kept = self._evidence if self._evidence and self._evidence[2].shape == built.shape else None
+            odds, other = kept[2:] if kept else (np.empty_like(built), np.empty_like(built))
+            self._evidence = None
             split(
                 lambda i0, i1: _log_covers(
                     built, known, rates.false_alarm, rates.hit - rates.false_alarm, odds, other, i0, i1

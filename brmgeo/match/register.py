@@ -1,7 +1,8 @@
 """Sub-cell registration of a view on the full-resolution building map, with its own covariance.
 
-The log-likelihood ratio of the belief is summed at the map's own pixels for small offsets and turns about a
-guess: first on 2 m pixels over the whole window, then on the map's own over what is left. The ratio's
+The log-likelihood ratio of points (``Rates.weights``) is summed at the map's own pixels for small offsets and turns
+about a guess: first on 2 m pixels over the whole window, then on the map's own over what is left. On 2 m pixels it is
+linear in the building share, hence a little low where outlines are ragged. The ratio's
 exponential over all offsets and turns is the posterior under an even prior in the window; its moments are the
 pose and its covariance. The covariance is widened by a floor for what the model leaves out (roofs that lean,
 height, map errors of decimetres).

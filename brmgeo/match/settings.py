@@ -79,7 +79,7 @@ class RateSettings:
         false_alarm: P0, the same elsewhere, (0, hit).
         independent_m2: ground area that carries one independent observation, square metres, [1, 1e5]: mask and map
             differ by whole buildings, so pixels of one building count together.
-        llr_min, llr_max: bounds of one frame's log-likelihood ratio, [-50, 0] and [1, 100]: a frame may be
+        llr_min, llr_max: bounds of one frame's log-likelihood ratio, [-50, 0] and [1, 80]: a frame may be
             wrong as a whole.
         repeat: weight of a view's evidence per share of new ground in it, [0.1, 100]: views overlap, and what
             two of them show counts little more than once, else a hovering aircraft would grow sure of a place
@@ -115,7 +115,7 @@ class RateSettings:
             false_alarm=(0.0005, 0.9),
             independent_m2=(1, 1e5),
             llr_min=(-50, 0),
-            llr_max=(1, 100),
+            llr_max=(1, 80),  # its exponential is a float32
             repeat=(0.1, 100),
             systematic_sigma_m=(0, 100),
             least_fit=(0, 1),

@@ -187,6 +187,16 @@ def test_a_network_over_ground_it_was_trained_on_is_told(
     flight = job.read_flight(pictured)
     with job.frame_masks(flight, "", job.NetworkUse(weights=own), job.Progress(), "town-a"):
         assert "trained on region town-a" in capsys.readouterr().err
+    # What the weights that it went on from were trained on counts, however long ago.
+    started = {"kind": "start", "data": {"sources": [{"kind": "start", "data": card.data}]}}
+    later = small_card(data={"sources": [started, {"name": "others", "regions": ["town-x"]}]})
+    assert "trained on region town-a" in job.trained_over(later, "town-a")
+    assert job.trained_over(later, "town-g") == ""
+
+
+@pytest.mark.parametrize("regions", [None, 5, [["demo"]], "demo"])
+def test_a_card_of_another_form_says_nothing(regions: object) -> None:
+    assert job.trained_over(small_card(data={"sources": [{"regions": regions}, "demo"]}), "demo") == ""
 
 
 def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
@@ -298,7 +308,13 @@ def test_sift_is_compared_on_the_same_flights(maps: Path, waypoints: Path, tmp_p
     assert float(rows["SIFT"]["median_after_first_fix_m"]) < 10
     text = (tmp_path / "summary.md").read_text()
     assert "easier than a real camera" in text
+    assert "masks-only" not in text
+    # It states no covariance, and its time is that of finding a place, not of drawing the frame.
+    assert rows["SIFT"]["within_1_sigma"] == ""
+    assert float(rows["SIFT"]["seconds_per_frame"]) > 0
     assert "needs a generated REGION" in say(*words, "--sift", "--season", "winter").line
+    assert "--hide does not hide" in say(*words, "--sift", "--hide", "east").line
+    assert "--methods: names none" in say(*words, "--methods", ",").line
 
 
 # ---------------------------------------------------------------- folders of images
