@@ -7,7 +7,8 @@ of one of these kinds:
 - ``tiles``: training tiles of regions by name, as ``brmgeo tiles`` cuts them (cut now where they are not as wanted);
 - ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
 - ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
-- ``flight``: a flight folder whose frames have masks; for tests only.
+- ``flight``: a flight folder whose frames have masks; for tests only. Masks of outlines on the ground are scored as they are
+  and, where ``roof_m`` says how high roofs stand, once more moved to where a camera sees roofs of that height.
 
 Folders that are not part of the project are given with ``--source NAME=PATH``.
 """
@@ -34,7 +35,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.flight.camera import ground_from_pixel, pixel_from_point, world_from_camera
 from brmgeo.flight.folder import read_flight
+from brmgeo.flight.readings import Camera
 from brmgeo.geo.grid import lattice
 from brmgeo.maps.rasterize import building_mask
 from brmgeo.region import describe_fault
@@ -87,6 +90,7 @@ class SourceSpec(_Spec):
     gsd_m: Annotated[float, Field(gt=0, le=1)] | None = None
     zoom: Annotated[int, Field(ge=10, le=24)] = 21
     validation_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    roof_m: Annotated[float, Field(ge=0, le=50)] = 0.0
     attribution: str = ""
     licence: str = ""
 
@@ -343,6 +347,9 @@ def gather(
                 digest.update(hashlib.sha256(image.tobytes() + label.tobytes()).digest())
         elif spec.kind == "flight":
             frames["test"][spec.name] = _flight_frames(paths[spec.name])
+            if spec.roof_m:
+                seen_at = f"{spec.name}, outlines at {spec.roof_m:g} m"
+                frames["test"][seen_at] = _flight_frames(paths[spec.name], spec.roof_m)
         else:
             for part, weight, source, pictures, seen_digest in _tile_sources(spec, data, recipe.work_gsd_m):
                 if part == "train":
@@ -452,18 +459,51 @@ def _frames_of(scene: Scene, gsd_m: float) -> list[Picture]:
     return found
 
 
-def _flight_frames(folder: Path) -> list[Picture]:
+def _flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
+    """The frames of a flight with its masks; with ``roof_m`` those outlines are moved up to roofs of that height."""
     flight = read_flight(folder)
     if not (flight.has_images and flight.has_masks):
         raise MissingInputError(f"{folder}: a flight to test on needs frames and masks")
 
     def reader(i: int) -> Callable[[], tuple[U8, U8]]:
         def read() -> tuple[U8, U8]:
-            return np.ascontiguousarray(flight.image(i)), check_label(flight.mask(i), flight.frames[i].file)
+            label = check_label(flight.mask(i), flight.frames[i].file)
+            if roof_m:
+                frame = flight.frames[i]
+                tilt = world_from_camera(flight.mount, frame.roll_rad, frame.pitch_rad, 0.0)
+                label = raised(label, flight.camera, tilt, frame.agl_m, roof_m)
+            return np.ascontiguousarray(flight.image(i)), label
 
         return read
 
     return [Picture(reader(i), frame_gsd_m(flight, i)) for i in range(len(flight.frames))]
+
+
+def raised(
+    label: U8, camera: Camera, world_from_cam: NDArray[np.float64], agl_m: float, height_m: float
+) -> U8:
+    """(h, w) uint8 label of what lies on the ground, as if it stood ``height_m`` above: where a camera sees the roofs.
+
+    Args:
+        world_from_cam: (3, 3) rotation of the camera, z upwards; any heading.
+        agl_m: height of the camera above ground.
+
+    What comes from beyond the frame is unknown. Raises SettingsError for a height that reaches the camera.
+    """
+    if not height_m < agl_m:
+        raise SettingsError(f"roof_m {height_m:g}: the camera is {agl_m:g} m above ground; give less")
+    h, w = label.shape
+    v, u = np.mgrid[:h, :w].astype(np.float64)
+    at = np.array([0.0, 0.0, agl_m])
+    xy = ground_from_pixel(camera, world_from_cam, at, np.dstack([u, v]), height_m)
+    source = pixel_from_point(camera, world_from_cam, at, np.dstack([xy, np.zeros((h, w))]))
+    source = np.nan_to_num(source, nan=-10.0).astype(np.float32)
+    return np.asarray(
+        cv2.remap(
+            label, source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN
+        ),
+        np.uint8,
+    )  # fmt: skip
 
 
 def _tile_sources(
@@ -592,6 +632,15 @@ def train(
                 "kind": "start",
                 "licence": before.licence,
                 "data": before.data,
+            }
+        )
+    elif settings.imagenet:
+        ground.credits.append(
+            {
+                "name": "efficientnet-lite0 learned on ImageNet, which the encoder went on from",
+                "kind": "start",
+                "attribution": "Tan and Le 2019, github.com/tensorflow/tpu; as PyTorch tensors by ML Illustrated",
+                "licence": "Apache-2.0",
             }
         )
     out.mkdir(parents=True, exist_ok=True)

@@ -47,6 +47,7 @@ class AugmentSettings:
         roofs: probability that roofs get other colours, building by building.
         objects: probability that courts, pools and paved squares are drawn on open ground.
         colour: strength of changes of brightness, contrast, gamma, white balance, saturation and hue; 1 is strong.
+        grey: probability that most or all colour is taken away.
         shadow, haze, blur, noise, jpeg: probabilities of each.
     """
 
@@ -57,6 +58,7 @@ class AugmentSettings:
     roofs: float = 0.4
     objects: float = 0.2
     colour: float = 0.8
+    grey: float = 0.0
     shadow: float = 0.3
     haze: float = 0.3
     blur: float = 0.4
@@ -69,7 +71,7 @@ class AugmentSettings:
             raise SettingsError(
                 f"augmentation gsd_m {self.gsd_m}: give (finest, coarsest), finest above 0 and not above coarsest"
             )
-        for name in ("near_buildings", "roofs", "objects", "shadow", "haze", "blur", "noise", "jpeg"):
+        for name in ("near_buildings", "roofs", "objects", "grey", "shadow", "haze", "blur", "noise", "jpeg"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"augmentation {name} {getattr(self, name)}: give a probability, 0 to 1")
         if not 0 <= self.tilt <= 0.3 or not 0 <= self.colour <= 2:
@@ -80,7 +82,7 @@ class AugmentSettings:
     @staticmethod
     def none(gsd_m: float) -> AugmentSettings:
         """Crops at one GSD, north up, with nothing changed: for validation."""
-        return AugmentSettings((gsd_m, gsd_m), False, 0.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0)
+        return AugmentSettings((gsd_m, gsd_m), False, 0.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 
 
 class Source(Protocol):
@@ -221,6 +223,11 @@ def recolour(image: U8, label: U8, gsd_m: float, rng: np.random.Generator, setti
         img = _objects(img, label, gsd_m, rng)
     if settings.colour > 0:
         img = _colour(img, settings.colour, rng)
+    if settings.grey > 0 and rng.random() < settings.grey:
+        left = np.float32(rng.uniform(0, 0.4))
+        img = (
+            left * img + (1 - left) * cv2.transform(img, np.array([[0.3, 0.59, 0.11]], np.float32))[..., None]
+        )
     if rng.random() < settings.shadow:
         img = _shadow(img, rng)
     if rng.random() < settings.haze:

@@ -220,7 +220,8 @@ def build_network(tensors: Mapping[str, NDArray[Any]], card: ModelCard, name: st
     from brmgeo.segment.unet import UNet, UNetSettings
 
     known = {f.name for f in fields(UNetSettings)}
-    foreign = sorted(set(card.settings) ^ known)
+    # Cards of before there was a choice of encoder do not name it.
+    foreign = sorted(set({"encoder": "plain", **card.settings}) ^ known)
     if foreign:
         raise InputError(
             f"{name}: the card's settings differ from a {ARCHITECTURE}'s in {', '.join(foreign)}"
@@ -271,7 +272,15 @@ def _inline(value: Any) -> str:
 
 def _prose(value: Any) -> list[str]:
     if isinstance(value, Mapping):
-        return [f"- {key}: {_inline(inner)}" for key, inner in value.items()]
+        lines = []
+        for key, inner in value.items():
+            several = isinstance(inner, list | tuple) and inner and all(isinstance(v, Mapping) for v in inner)
+            lines += (
+                [f"- {key}:", *(f"  - {_inline(v)}" for v in inner)]
+                if several
+                else [f"- {key}: {_inline(inner)}"]
+            )
+        return lines
     if isinstance(value, list | tuple):
         return [f"- {_inline(inner)}" for inner in value]
     return [str(value)]

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.flight.camera import pixel_from_point, world_from_camera
+from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.region import load_region
 from brmgeo.segment.predict import Segmenter
 from brmgeo.segment.shards import TileInfo
@@ -125,6 +127,31 @@ def test_pairs_cut_short_transparent_or_of_other_sizes(tmp_path: Path) -> None:
     image.with_suffix(".jpg").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="cut short"):
         network.read_pairs(tmp_path)
+
+
+def test_outlines_are_moved_to_where_a_camera_sees_roofs() -> None:
+    camera = Camera(400, 300, 300.0, 300.0, 199.5, 149.5)
+    # 20 degrees forward: pixels of one row see the same distance ahead.
+    tilt = world_from_camera(Attitude(0.0, math.radians(-20.0), 0.0), 0.0, 0.0, 0.0)
+    agl, roof = 60.0, 5.0
+    corners = np.array([[10.0, -8.0], [25.0, -8.0], [25.0, 6.0], [10.0, 6.0]])
+    at = np.array([0.0, 0.0, agl])
+
+    def drawn(z: float) -> np.ndarray:
+        uv = pixel_from_point(camera, tilt, at, np.column_stack([corners, np.full(4, z)]))
+        label = np.zeros((300, 400), np.uint8)
+        cv2.fillPoly(label, [np.rint(uv * 256).astype(np.int32)], 255, shift=8)
+        return label
+
+    moved = network.raised(drawn(0.0), camera, tilt, agl, roof)
+    want = drawn(roof)
+    known = moved != 127
+    assert known.mean() > 0.8
+    both, either = ((moved == 255) & (want == 255)).sum(), ((moved == 255) | ((want == 255) & known)).sum()
+    assert both / either > 0.97
+    assert ((drawn(0.0) == 255) & (want == 255)).sum() / (want == 255).sum() < 0.9
+    with pytest.raises(SettingsError, match="the camera is 60 m above ground"):
+        network.raised(want, camera, tilt, agl, 60.0)
 
 
 def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:

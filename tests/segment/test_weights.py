@@ -49,6 +49,15 @@ def test_what_is_written_comes_back(weights: Path) -> None:
     assert sorted(p.name for p in weights.parent.iterdir()) == ["w.md", "w.safetensors"]
 
 
+def test_the_readable_card_gives_every_source_a_line_of_its_own() -> None:
+    sources = [{"name": "Kampala", "licence": "CC BY 4.0"}, {"name": "towns", "seeds": (1, 2)}]
+    text = small_card(data={"steps": 7, "sources": sources}).to_markdown("w")
+    lines = text.splitlines()
+    at = lines.index("- sources:")
+    assert lines[at + 1 : at + 3] == ["  - name Kampala, licence CC BY 4.0", "  - name towns, seeds 1, 2"]
+    assert "- steps: 7" in lines
+
+
 def test_same_weights_same_bytes(weights: Path, tmp_path: Path) -> None:
     tensors, card = load_weights(weights)
     again = tmp_path / "again.safetensors"
