@@ -61,6 +61,7 @@ _SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif")
 _FRAME_PX = 512
 _FRAMES_MOST = 150
+_ROWS = 256  # of a frame that are raised at a time
 
 
 # --- recipes -----------------------------------------------------------------------------------------------------
@@ -255,10 +256,12 @@ def _assembled(
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One frame to be scored: how to read its (image, label), and its GSD."""
+    """One frame to be scored: how to read its (image, label), its GSD, and how its label is raised to ``roof_m``."""
 
     read: Callable[[], tuple[U8, U8]]
     gsd_m: float
+    raised: Callable[[U8], U8] | None = None
+    roof_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,10 +349,7 @@ def gather(
             for image, label in small:
                 digest.update(hashlib.sha256(image.tobytes() + label.tobytes()).digest())
         elif spec.kind == "flight":
-            frames["test"][spec.name] = _flight_frames(paths[spec.name])
-            if spec.roof_m:
-                seen_at = f"{spec.name}, outlines at {spec.roof_m:g} m"
-                frames["test"][seen_at] = _flight_frames(paths[spec.name], spec.roof_m)
+            frames["test"][spec.name] = _flight_frames(paths[spec.name], spec.roof_m)
         else:
             for part, weight, source, pictures, seen_digest in _tile_sources(spec, data, recipe.work_gsd_m):
                 if part == "train":
@@ -421,6 +421,8 @@ def _checked(
             raise SettingsError(f"recipe source {spec.name}: is of kind {spec.kind} and names no {needs}")
         if spec.kind == "flight" and spec.split != "test":
             raise SettingsError(f'recipe source {spec.name}: a flight is for tests only: split = "test"')
+        if spec.roof_m and spec.kind != "flight":
+            raise SettingsError(f"recipe source {spec.name}: roof_m is of flights only; take it out")
         if spec.kind == "pairs" and (spec.gsd_m is None or spec.split != "train"):
             raise SettingsError(f"recipe source {spec.name}: pairs are for training, and need their gsd_m")
         if spec.kind == "tiles":
@@ -460,23 +462,35 @@ def _frames_of(scene: Scene, gsd_m: float) -> list[Picture]:
 
 
 def _flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
-    """The frames of a flight with its masks; with ``roof_m`` those outlines are moved up to roofs of that height."""
+    """The frames of a flight with its masks, which can be raised to roofs of a height above 0.
+
+    Raises MissingInputError without frames or masks, SettingsError where the roofs reach a camera.
+    """
     flight = read_flight(folder)
     if not (flight.has_images and flight.has_masks):
         raise MissingInputError(f"{folder}: a flight to test on needs frames and masks")
+    for frame in flight.frames:
+        if frame.agl_m <= 2 * roof_m:
+            raise SettingsError(
+                f"{folder}: frame {frame.file} was taken {frame.agl_m:g} m above ground, too low for roof_m {roof_m:g}: "
+                "take such frames out of the flight, or roof_m out of the recipe"
+            )
 
     def reader(i: int) -> Callable[[], tuple[U8, U8]]:
         def read() -> tuple[U8, U8]:
-            label = check_label(flight.mask(i), flight.frames[i].file)
-            if roof_m:
-                frame = flight.frames[i]
-                tilt = world_from_camera(flight.mount, frame.roll_rad, frame.pitch_rad, 0.0)
-                label = raised(label, flight.camera, tilt, frame.agl_m, roof_m)
-            return np.ascontiguousarray(flight.image(i)), label
+            return np.ascontiguousarray(flight.image(i)), check_label(flight.mask(i), flight.frames[i].file)
 
         return read
 
-    return [Picture(reader(i), frame_gsd_m(flight, i)) for i in range(len(flight.frames))]
+    def raiser(i: int) -> Callable[[U8], U8]:
+        frame = flight.frames[i]
+        tilt = world_from_camera(flight.mount, frame.roll_rad, frame.pitch_rad, 0.0)
+        return lambda label: raised(label, flight.camera, tilt, frame.agl_m, roof_m)
+
+    return [
+        Picture(reader(i), frame_gsd_m(flight, i), raiser(i) if roof_m else None, roof_m)
+        for i in range(len(flight.frames))
+    ]
 
 
 def raised(
@@ -488,22 +502,22 @@ def raised(
         world_from_cam: (3, 3) rotation of the camera, z upwards; any heading.
         agl_m: height of the camera above ground.
 
-    What comes from beyond the frame is unknown. Raises SettingsError for a height that reaches the camera.
+        height_m: below the camera.
+
+    What comes from beyond the frame is unknown.
     """
-    if not height_m < agl_m:
-        raise SettingsError(f"roof_m {height_m:g}: the camera is {agl_m:g} m above ground; give less")
     h, w = label.shape
-    v, u = np.mgrid[:h, :w].astype(np.float64)
     at = np.array([0.0, 0.0, agl_m])
-    xy = ground_from_pixel(camera, world_from_cam, at, np.dstack([u, v]), height_m)
-    source = pixel_from_point(camera, world_from_cam, at, np.dstack([xy, np.zeros((h, w))]))
-    source = np.nan_to_num(source, nan=-10.0).astype(np.float32)
-    return np.asarray(
-        cv2.remap(
+    out = np.empty_like(label)
+    for top in range(0, h, _ROWS):
+        v, u = np.mgrid[top : min(top + _ROWS, h), :w].astype(np.float64)
+        xy = ground_from_pixel(camera, world_from_cam, at, np.dstack([u, v]), height_m)
+        source = pixel_from_point(camera, world_from_cam, at, np.dstack([xy, np.zeros(u.shape)]))
+        source = np.nan_to_num(source, nan=-10.0).astype(np.float32)
+        out[top : top + _ROWS] = cv2.remap(
             label, source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN
-        ),
-        np.uint8,
-    )  # fmt: skip
+        )  # fmt: skip
+    return out
 
 
 def _tile_sources(
@@ -599,6 +613,7 @@ def train(
     (.safetensors) to go on from in place of random ones. Raises SettingsError, InputError.
     """
     from brmgeo.segment import train as engine
+    from brmgeo.segment.encoder import imagenet_weights
     from brmgeo.segment.unet import UNetSettings
     from brmgeo.segment.weights import load_weights
 
@@ -619,13 +634,16 @@ def train(
             "pictures would be resampled to what was never trained for"
         )
     settings = replace(settings, threads=threads or settings.threads or _cores())
+    # What a first run lacks is said before any ground is painted.
+    engine.require_fit(unet, settings)
+    initial, before = load_weights(start) if start is not None else (None, None)
+    if settings.imagenet and initial is None and not engine.checkpoint_of(out).exists():
+        imagenet_weights()
     ground = gather(recipe, data, paths or {}, test_regions, augment.gsd_m[0], say)
     crops = engine.validation_crops(
         [s for _, s in ground.crops], recipe.validation_crops, settings.crop_px, recipe.work_gsd_m
     )
-    initial = None
-    if start is not None:
-        initial, before = load_weights(start)
+    if before is not None:
         ground.credits.append(
             {
                 "name": f"weights {before.digest}, which it went on from",
@@ -731,11 +749,10 @@ def finish(
     segmenter = Segmenter.load(weights, "torch")
     scores = {
         # What cannot be told of a source (features of frames without room for a disc) is left out.
-        f"{split}: {name}": {
-            k: v for k, v in score(segmenter, pictures).summary().items() if math.isfinite(v)
-        }
+        f"{split}: {name}{height}": {k: v for k, v in own.summary().items() if math.isfinite(v)}
         for split, sets in (("validation", ground.validation), ("test", ground.test))
         for name, pictures in sets.items()
+        for height, own in score(segmenter, pictures).items()
     }
     for name, row in scores.items():
         told = ", ".join(f"{k} {v:g}" for k, v in row.items())
@@ -748,13 +765,21 @@ def finish(
     return {"calibration": calibration, "scores": scores}
 
 
-def score(segmenter: Any, pictures: Sequence[Picture]) -> Scores:
-    """The scores of frames by a ``brmgeo.segment.predict.Segmenter``, at the frames' own GSD."""
-    total = Scores()
+def score(segmenter: Any, pictures: Sequence[Picture]) -> dict[str, Scores]:
+    """The scores of frames by a ``brmgeo.segment.predict.Segmenter``, at the frames' own GSD.
+
+    Under "" those of the labels as they are; where labels can be raised, under ", outlines at H m" those of raised ones.
+    """
+    total = {"": Scores()}
     for picture in pictures:
         image, label = picture.read()
         probability = segmenter.probability(image, picture.gsd_m)
-        total = total + segmentation_scores(probability, label, segmenter.card.threshold, picture.gsd_m)
+        labels = {"": label}
+        if picture.raised:
+            labels[f", outlines at {picture.roof_m:g} m"] = picture.raised(label)
+        for height, own in labels.items():
+            found = segmentation_scores(probability, own, segmenter.card.threshold, picture.gsd_m)
+            total[height] = total.get(height, Scores()) + found
     return total
 
 

@@ -2,8 +2,8 @@
 
 After Tan and Le, "EfficientNet: Rethinking Model Scaling for Convolutional Neural Networks" (ICML 2019), in the form that
 its authors published for small processors (github.com/tensorflow/tpu, models/official/efficientnet/lite): inverted
-residual blocks without squeeze-and-excitation, ReLU6. Ours differs in one thing: strided convolutions are padded alike on
-all sides, so that features lie where their pixels lie.
+residual blocks without squeeze-and-excitation, ReLU6. Ours ends earlier (``STAGES``), and strided convolutions are padded
+alike on all sides, so that features lie where their pixels lie.
 
 Its value is in the weights that it can start from: those learned on ImageNet's photographs know edges, textures and things
 that a few hectares of real ground with labels cannot teach.

@@ -55,7 +55,7 @@ class TrainSettings:
         batch: crops a forward pass; accumulate: passes a step (their gradients are averaged).
         crop_px: side of a crop, a multiple of the U-Net's ``multiple_px``.
         lr, warmup_steps: the highest learning rate, and the steps to reach it; then a cosine down to a hundredth.
-        encoder_lr: the same of a pretrained encoder, as a share of lr: less keeps more of what it knew.
+        encoder_lr: the same of a ``efficientnet-lite0`` encoder, as a share of lr: less keeps more of what it knew.
         weight_decay: of convolution weights; norms and biases have none.
         ema: decay of the moving average of the weights, a step.
         overlap_weight: of the Tversky term, beside cross-entropy's 1.
@@ -65,7 +65,8 @@ class TrainSettings:
         checkpoint_steps: steps between checkpoints; one is also written at every epoch.
         threads: of torch; 0 leaves them as they are.
         device: ``cpu``, ``cuda``, or ``auto``: a GPU where there is one, in bfloat16.
-        imagenet: start a ``efficientnet-lite0`` encoder from weights learned on ImageNet, in place of random ones.
+        imagenet: start a ``efficientnet-lite0`` encoder from weights learned on ImageNet, in place of random ones; not
+            where the whole network goes on from weights of its own.
         compile: let torch.compile fuse the network's passes; a step then takes 0.7 times as long on one core, 0.9 times
             on two, after half a minute of compiling. Needs a C++ compiler.
 
@@ -192,6 +193,28 @@ def rate_at(step: int, settings: TrainSettings) -> float:
     return settings.lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0))))
 
 
+def require_fit(unet: UNetSettings, settings: TrainSettings) -> None:
+    """Raises SettingsError where a network cannot be trained with such settings."""
+    multiple = unet.multiple_px
+    named = f"a U-Net of {len(unet.widths)} levels, encoder {unet.encoder},"
+    if settings.crop_px % multiple:
+        raise SettingsError(f"crops of {settings.crop_px} px: {named} takes multiples of {multiple}")
+    if settings.batch == 1 and settings.crop_px == multiple and unet.norm == "batch":
+        raise SettingsError(
+            f"batch 1 with crops of {multiple} px: the coarsest level of {named} sees one pixel, which batch normalisation "
+            "cannot take; give a larger batch or larger crops"
+        )
+    if unet.encoder == "plain" and (settings.imagenet or settings.encoder_lr != 1.0):
+        raise SettingsError(
+            'training imagenet, encoder_lr: need [unet] encoder = "efficientnet-lite0"; the plain one has no such weights'
+        )
+
+
+def checkpoint_of(folder: Path) -> Path:
+    """Where the checkpoint of a run in a folder lies."""
+    return folder / "checkpoint.safetensors"
+
+
 class Trainer:
     """One training run in one folder.
 
@@ -217,17 +240,10 @@ class Trainer:
         data: str = "",
         initial: Mapping[str, NDArray[Any]] | None = None,
     ) -> None:
-        if settings.crop_px % unet.multiple_px:
-            raise SettingsError(
-                f"crops of {settings.crop_px} px: a U-Net of {len(unet.widths)} levels takes multiples of {unet.multiple_px}"
-            )
-        if settings.imagenet and unet.encoder == "plain":
-            raise SettingsError(
-                'training imagenet = true: needs [unet] encoder = "efficientnet-lite0"; the plain one has no such weights'
-            )
+        require_fit(unet, settings)
         self._unet, self._settings, self._augment = unet, settings, augment
         self._source, self._validation = source, validation
-        self._path = folder / "checkpoint.safetensors"
+        self._path = checkpoint_of(folder)
         what = {
             "unet": unet.plain(),
             "settings": {
@@ -263,15 +279,15 @@ class Trainer:
         with torch.random.fork_rng():
             torch.manual_seed(self._settings.seed)
             model = UNet(self._unet)
-        if self._settings.imagenet and not self._initial:
+        if self._settings.imagenet and not self._initial and not self._path.exists():
             start_from_imagenet(model.encoder, imagenet_weights(), MEAN, STD)
         if self._initial:
             try:
                 model.load_state_dict(self._initial)
             except RuntimeError:
                 raise InputError(
-                    f"the weights to go on from are not of a U-Net of the widths {list(self._unet.widths)} with "
-                    f"{self._unet.norm} norm: give the recipe their settings"
+                    f"the weights to go on from are not of a U-Net of the widths {list(self._unet.widths)}, "
+                    f"{self._unet.norm} norm and encoder {self._unet.encoder}: give the recipe their settings"
                 ) from None
         average = UNet(self._unet)
         average.load_state_dict(model.state_dict())

@@ -237,7 +237,7 @@ def build_network(tensors: Mapping[str, NDArray[Any]], card: ModelCard, name: st
         if key not in wanted or found != wanted[key]:
             raise InputError(
                 f"{name}: tensor {key} is {found}, a {ARCHITECTURE} of widths {list(settings.widths)} "
-                f"has {wanted.get(key, 'none of this name')}: weights of another architecture"
+                f"and encoder {settings.encoder} has {wanted.get(key, 'none of this name')}: weights of another architecture"
             )
     network.load_state_dict({key: torch.from_numpy(np.array(value)) for key, value in tensors.items()})
     return network.eval()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from pipelines import network, training
 from pipelines.cli import cli
 
 ROOT = Path(__file__).resolve().parents[2]
+REAL = Path(os.environ.get("BRMGEO_REAL_DATA", ROOT.parent / "shared" / "data"))
 RECIPES = ROOT / "data" / "recipes"
 
 TINY = """
@@ -150,8 +152,31 @@ def test_outlines_are_moved_to_where_a_camera_sees_roofs() -> None:
     both, either = ((moved == 255) & (want == 255)).sum(), ((moved == 255) | ((want == 255) & known)).sum()
     assert both / either > 0.97
     assert ((drawn(0.0) == 255) & (want == 255)).sum() / (want == 255).sum() < 0.9
-    with pytest.raises(SettingsError, match="the camera is 60 m above ground"):
-        network.raised(want, camera, tilt, agl, 60.0)
+    # Tilted to the horizon: sky is unknown, and nothing else breaks.
+    sky = world_from_camera(Attitude(0.0, math.radians(-85.0), 0.0), 0.0, 0.0, 0.0)
+    over = network.raised(np.full((300, 400), 255, np.uint8), camera, sky, agl, roof)
+    assert {*np.unique(over)} == {127, 255}
+
+
+@pytest.mark.skipif(
+    not (REAL / "flight-sheffield").exists(), reason="real flight not here: set BRMGEO_REAL_DATA"
+)
+def test_a_real_flights_outlines_are_raised_away_from_the_camera() -> None:
+    pictures = network._flight_frames(REAL / "flight-sheffield", 3.0)
+    moved = []
+    for picture in pictures[::10]:
+        label = picture.read()[1]
+        assert picture.raised is not None
+        up = picture.raised(label)
+        both = (label != 127) & (up != 127)
+        if (label[both] == 255).mean() > 0.05:
+            rows = [np.flatnonzero(((m == 255) & both).any(1)).mean() for m in (label, up)]
+            moved.append(rows[1] - rows[0])
+    # The camera looks 16 degrees forward: the most of a frame lies ahead, where what stands is seen further up.
+    assert len(moved) >= 3
+    assert np.median(moved) < -1
+    with pytest.raises(SettingsError, match="too low for roof_m 40"):
+        network._flight_frames(REAL / "flight-sheffield", 40.0)
 
 
 def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:
@@ -220,6 +245,8 @@ def test_recipes_that_are_wrong_are_refused_in_one_line(tmp_path: Path) -> None:
         ("gsd_m = [0.2, 0.4]", "gsd_m = [0.2]", "augment"),
         ("gsd_m = [0.2, 0.4]", "gsd_m = [0.3, 0.4]", "work_gsd_m 0.25 lies outside"),
         ("widths = [8, 16]", "widths = [8, 16]\nin_channels = 4", "pictures have 3"),
+        ("crop_px = 32", "crop_px = 31", "multiples of 2"),
+        ("steps = 4", "steps = 4\nimagenet = true", r"need \[unet\] encoder"),
     ):
         path.write_text(TINY.replace(right, wrong))
         with pytest.raises(SettingsError, match=said):
@@ -240,6 +267,8 @@ def test_sources_that_are_wrong_are_refused(tmp_path: Path) -> None:
         gather(TINY, tmp_path, nowhere=tmp_path)
     with pytest.raises(SettingsError, match="tests only"):
         gather(TINY.replace('kind = "flight"\nsplit = "test"', 'kind = "flight"'), tmp_path, flown=tmp_path)
+    with pytest.raises(SettingsError, match="roof_m is of flights only"):
+        gather(TINY.replace("seeds = [903]", "seeds = [903]\nroof_m = 3.0"), tmp_path)
     with pytest.raises(SettingsError, match="two sources have this name"):
         gather(TINY.replace('name = "far"', 'name = "held"'), tmp_path)
     with pytest.raises(SettingsError, match="names no seeds"):

@@ -49,6 +49,23 @@ def test_onnx_and_torch_agree(weights: Path, shape: tuple[int, int, int]) -> Non
     np.testing.assert_allclose(got, wanted, atol=1e-4)
 
 
+@pytest.mark.slow
+def test_a_pretrained_kind_is_exported_too(tmp_path: Path) -> None:
+    from brmgeo.segment.unet import UNet, UNetSettings
+
+    torch.manual_seed(2)
+    network = UNet(UNetSettings(widths=(8, 8, 8, 8, 8), encoder="efficientnet-lite0"))
+    network.train()(torch.randn(4, 3, 64, 64))  # statistics that are not those of a new network
+    path = tmp_path / "w.safetensors"
+    tensors = {k: v.numpy() for k, v in network.state_dict().items()}
+    save_weights(path, tensors, small_card(settings=network.settings.plain()))
+    export_onnx(path, path.with_suffix(".onnx"))
+    by_onnx, by_torch = (Segmenter.load(path, backend) for backend in ("onnx", "torch"))
+    for shape in ((16, 16), (32, 40), (75, 100)):
+        image = np.random.default_rng(1).integers(0, 256, (*shape, 3), dtype=np.uint8)
+        np.testing.assert_allclose(by_onnx.probability(image), by_torch.probability(image), atol=1e-4)
+
+
 def test_both_backends_give_the_same_pictures(weights: Path) -> None:
     image = np.random.default_rng(1).integers(0, 256, (75, 100, 3), dtype=np.uint8)
     by_onnx, by_torch = (Segmenter.load(weights, backend) for backend in ("onnx", "torch"))

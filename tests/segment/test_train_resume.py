@@ -78,6 +78,85 @@ def test_a_killed_run_ends_as_one_that_was_not(tmp_path: Path, crops: Any, kille
         assert torch.equal(tensor, state_of(resumed)[name]), name
 
 
+LITE = UNetSettings(widths=(8, 8, 8, 8, 8), encoder="efficientnet-lite0")
+LITE_SETTINGS = dataclasses.replace(
+    SETTINGS,
+    steps=3,
+    batch=2,
+    accumulate=1,
+    crop_px=64,
+    warmup_steps=1,
+    epoch_steps=2,
+    encoder_lr=0.25,
+    weight_decay=0.0,
+)
+
+
+def lite(folder: Path, settings: TrainSettings = LITE_SETTINGS) -> Trainer:
+    source = Scenes([town(1)])
+    return Trainer(
+        LITE, settings, AugmentSettings(grey=0.5), source, validation_crops([source], 2, 64, 0.3), folder
+    )
+
+
+def test_a_killed_run_of_a_pretrained_kind_ends_as_one_that_was_not(tmp_path: Path) -> None:
+    whole = lite(tmp_path / "whole").train()
+
+    def kill(step: int, loss: float) -> None:
+        if step == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        lite(tmp_path / "killed", LITE_SETTINGS).train(on_step=kill)
+    resumed = lite(tmp_path / "killed").train()
+    for name, tensor in state_of(whole).items():
+        assert torch.equal(tensor, state_of(resumed)[name]), name
+
+
+def test_the_encoder_learns_at_its_own_rate_and_every_weight_learns(tmp_path: Path) -> None:
+    own = lite(tmp_path)
+    run = own.start()
+    own.advance(run)
+    rates = {id(p): g["lr"] for g in run.optimiser.param_groups for p in g["params"]}
+    full = rate_at(0, LITE_SETTINGS)
+    for name, parameter in run.model.named_parameters():
+        assert rates[id(parameter)] == pytest.approx(full * (0.25 if name.startswith("encoder.") else 1.0)), (
+            name
+        )
+
+
+def test_imagenet_weights_are_where_a_run_starts_and_nothing_else_needs_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = dataclasses.replace(LITE_SETTINGS, imagenet=True, steps=1, warmup_steps=0)
+    started: list[Path] = []
+    monkeypatch.setattr(engine, "imagenet_weights", lambda: tmp_path / "published.pth")
+    monkeypatch.setattr(engine, "start_from_imagenet", lambda encoder, path, mean, std: started.append(path))
+    own = lite(tmp_path / "run", settings)
+    own.save(own.start())
+    assert started == [tmp_path / "published.pth"]
+    lite(tmp_path / "run", settings).start()
+    source = Scenes([town(1)])
+    given = engine.tensors_of(own.start().best)
+    Trainer(
+        LITE, settings, AugmentSettings(), source, (np.empty(0), np.empty(0)), tmp_path / "b", "", given
+    ).start()
+    assert len(started) == 1
+
+
+@pytest.mark.parametrize("changes", [{"imagenet": True}, {"encoder_lr": 0.5}])
+def test_what_only_a_pretrained_encoder_has_is_refused_without_one(changes: dict[str, Any]) -> None:
+    with pytest.raises(SettingsError, match=r"need \[unet\] encoder"):
+        engine.require_fit(TINY, dataclasses.replace(SETTINGS, **changes))
+
+
+def test_one_crop_of_one_coarsest_pixel_is_refused() -> None:
+    alone = dataclasses.replace(SETTINGS, batch=1, crop_px=32)
+    with pytest.raises(SettingsError, match="give a larger batch"):
+        engine.require_fit(LITE, alone)
+    engine.require_fit(TINY, alone)
+
+
 def test_a_finished_run_has_nothing_left_to_do(tmp_path: Path, crops: Any) -> None:
     trainer(tmp_path, crops).train()
     steps: list[int] = []
@@ -164,7 +243,7 @@ def test_a_run_goes_on_from_given_weights_or_refuses_them(tmp_path: Path, crops:
     with pytest.raises(InputError, match="other settings or data"):
         Trainer(TINY, SETTINGS, mild, source, crops, tmp_path / "second", "").start()
     other = UNetSettings(widths=(8, 16, 32))
-    with pytest.raises(InputError, match="not of a U-Net"):
+    with pytest.raises(InputError, match=r"not of a U-Net .* encoder plain"):
         Trainer(other, SETTINGS, mild, source, crops, tmp_path / "third", "", weights).start()
 
 
@@ -227,7 +306,7 @@ def test_the_rate_rises_then_falls_to_a_hundredth() -> None:
 
 @pytest.mark.parametrize(
     "bad", [{"steps": 0}, {"lr": 0.0}, {"ema": 1.0}, {"warmup_steps": 2000}, {"device": "tpu"}, {"batch": 0}, {"seed": -1},
-     {"stop_after": -5}],
+     {"stop_after": -5}, {"encoder_lr": 0.0}, {"encoder_lr": 1.5}],
 )  # fmt: skip
 def test_settings_that_cannot_train_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(SettingsError, match="training"):
