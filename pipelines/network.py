@@ -42,7 +42,7 @@ from brmgeo.geo.grid import lattice
 from brmgeo.maps.rasterize import building_mask
 from brmgeo.region import describe_fault
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, shrunk
-from brmgeo.segment.metrics import LogitHistogram, Scores, segmentation_scores
+from brmgeo.segment.metrics import LogitHistogram, Scores, best_threshold, segmentation_scores
 from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles
 from brmgeo.segment.shards import TileSet, check_label, read_tiles
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
@@ -736,7 +736,7 @@ def finish(
         histogram.other += np.rint(own.other * times).astype(np.int64)
     temperature = histogram.temperature()
     card = replace(
-        card, temperature=round(temperature, 4), threshold=round(histogram.best_threshold(temperature), 3)
+        card, temperature=round(temperature, 4), threshold=round(best_threshold(parts, temperature), 3)
     )
     calibration = {
         "temperature": card.temperature,

@@ -9,6 +9,7 @@ Labels are uint8: 0 other, 255 building, 127 unknown; unknown pixels count nowhe
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import cv2
@@ -213,17 +214,16 @@ class LogitHistogram:
         )
         return float(math.exp(found.x))
 
-    def best_threshold(self, temperature: float) -> float:
-        """The calibrated probability above which building has the highest IoU; 0.5 without both classes."""
-        if not self.building.any() or not self.other.any():
-            return 0.5
-        # At the upper edge of bin i the bins after it are building.
+    def ious(self) -> NDArray[np.float64]:
+        """(BINS,) float64: the IoU of building where the bins after each one are called that."""
         hit = self.building[::-1].cumsum()[::-1]
         false = self.other[::-1].cumsum()[::-1]
-        iou = np.append(hit[1:], 0) / (self.building.sum() + np.append(false[1:], 0))
-        edge = self.logits + 0.025
-        probability = 1 / (1 + np.exp(-edge / temperature))
-        return float(np.clip(probability[int(np.argmax(iou))], 0.01, 0.99))
+        union = self.building.sum() + np.append(false[1:], 0)
+        return np.asarray(np.append(hit[1:], 0) / np.maximum(union, 1), np.float64)
+
+    def best_threshold(self, temperature: float) -> float:
+        """The calibrated probability above which building has the highest IoU; 0.5 without both classes."""
+        return best_threshold([self], temperature)
 
     def reliability(
         self, temperature: float
@@ -243,3 +243,17 @@ class LogitHistogram:
         said, was, count = self.reliability(temperature)
         filled = count > 0
         return float((np.abs(said - was)[filled] * count[filled]).sum() / max(int(count.sum()), 1))
+
+
+def best_threshold(grounds: Sequence[LogitHistogram], temperature: float) -> float:
+    """The calibrated probability above which building has the highest mean of the grounds' IoUs.
+
+    A mean of IoUs, not the IoU of all pixels: else the ground with the most building would choose alone. Grounds without
+    both classes have no say; 0.5 where none has.
+    """
+    told = [g for g in grounds if g.building.any() and g.other.any()]
+    if not told:
+        return 0.5
+    mean = np.mean([g.ious() for g in told], axis=0)
+    edge = told[0].logits[int(np.argmax(mean))] + 0.025
+    return float(np.clip(1 / (1 + np.exp(-edge / temperature)), 0.01, 0.99))

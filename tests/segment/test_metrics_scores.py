@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brmgeo.maps.ratio import disc_counts
-from brmgeo.segment.metrics import LogitHistogram, Scores, ring_features, segmentation_scores
+from brmgeo.segment.metrics import LogitHistogram, Scores, best_threshold, ring_features, segmentation_scores
 
 
 def random_frame(seed: int, shape: tuple[int, int] = (37, 52)) -> tuple[np.ndarray, np.ndarray]:
@@ -166,3 +166,25 @@ def test_unknown_and_missing_pixels_count_nowhere() -> None:
     assert (histogram.building.sum(), histogram.other.sum()) == (0, 1)
     assert histogram.temperature() == 1.0
     assert histogram.best_threshold(1.0) == 0.5
+
+
+def test_every_ground_has_the_same_say_about_the_threshold() -> None:
+    rng = np.random.default_rng(4)
+
+    def ground(share: float, shift: float) -> LogitHistogram:
+        label = np.where(rng.random((200, 200)) < share, 255, 0).astype(np.uint8)
+        logits = rng.normal(np.where(label == 255, 2.0, -2.0) + shift, 1.5).astype(np.float32)
+        own = LogitHistogram()
+        own.add(logits, label)
+        return own
+
+    dense, sparse, empty = ground(0.5, 1.0), ground(0.05, -0.5), LogitHistogram()
+    found = best_threshold([dense, sparse, empty], 1.0)
+    at = int(np.argmin(np.abs(1 / (1 + np.exp(-(dense.logits + 0.025))) - found)))
+    mean = (dense.ious() + sparse.ious()) / 2
+    assert mean[at] == pytest.approx(mean.max(), abs=1e-9)
+    # All pixels in one pot ask the ground with the most building only.
+    pot = LogitHistogram(dense.building + sparse.building, dense.other + sparse.other)
+    assert pot.best_threshold(1.0) != pytest.approx(found, abs=0.02)
+    assert sparse.ious()[at] > sparse.ious()[int(np.argmax(pot.ious()))]
+    assert best_threshold([empty], 1.0) == 0.5
