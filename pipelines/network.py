@@ -501,8 +501,7 @@ def raised(
     Args:
         world_from_cam: (3, 3) rotation of the camera, z upwards; any heading.
         agl_m: height of the camera above ground.
-
-        height_m: below the camera.
+        height_m: of what stands, below the camera.
 
     What comes from beyond the frame is unknown.
     """
