@@ -35,9 +35,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.flight.camera import ground_from_pixel, pixel_from_point, world_from_camera
+from brmgeo.flight.camera import world_from_camera
 from brmgeo.flight.folder import read_flight
-from brmgeo.flight.readings import Camera
+from brmgeo.flight.view import raised
 from brmgeo.geo.grid import lattice
 from brmgeo.maps.rasterize import building_mask
 from brmgeo.region import describe_fault
@@ -61,7 +61,6 @@ _SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif")
 _FRAME_PX = 512
 _FRAMES_MOST = 150
-_ROWS = 256  # of a frame that are raised at a time
 
 
 # --- recipes -----------------------------------------------------------------------------------------------------
@@ -76,8 +75,8 @@ class SourceSpec(_Spec):
 
     ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation.
     ``tiles`` that are for training take their regions' own train and validation splits; a region is in one source
-    only. ``weight``: how often the
-    source is drawn in training.
+    only. ``weight``: how often the source is drawn in training. ``roof_m``: of a flight, the height of the roofs that its
+    outlines are also scored at; 0: only as they are.
     """
 
     name: str
@@ -485,38 +484,12 @@ def _flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
     def raiser(i: int) -> Callable[[U8], U8]:
         frame = flight.frames[i]
         tilt = world_from_camera(flight.mount, frame.roll_rad, frame.pitch_rad, 0.0)
-        return lambda label: raised(label, flight.camera, tilt, frame.agl_m, roof_m)
+        return lambda label: raised(label, flight.camera, tilt, frame.agl_m, roof_m, UNKNOWN)
 
     return [
         Picture(reader(i), frame_gsd_m(flight, i), raiser(i) if roof_m else None, roof_m)
         for i in range(len(flight.frames))
     ]
-
-
-def raised(
-    label: U8, camera: Camera, world_from_cam: NDArray[np.float64], agl_m: float, height_m: float
-) -> U8:
-    """(h, w) uint8 label of what lies on the ground, as if it stood ``height_m`` above: where a camera sees the roofs.
-
-    Args:
-        world_from_cam: (3, 3) rotation of the camera, z upwards; any heading.
-        agl_m: height of the camera above ground.
-        height_m: of what stands, below the camera.
-
-    What comes from beyond the frame is unknown.
-    """
-    h, w = label.shape
-    at = np.array([0.0, 0.0, agl_m])
-    out = np.empty_like(label)
-    for top in range(0, h, _ROWS):
-        v, u = np.mgrid[top : min(top + _ROWS, h), :w].astype(np.float64)
-        xy = ground_from_pixel(camera, world_from_cam, at, np.dstack([u, v]), height_m)
-        source = pixel_from_point(camera, world_from_cam, at, np.dstack([xy, np.zeros(u.shape)]))
-        source = np.nan_to_num(source, nan=-10.0).astype(np.float32)
-        out[top : top + _ROWS] = cv2.remap(
-            label, source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN
-        )  # fmt: skip
-    return out
 
 
 def _tile_sources(
@@ -612,7 +585,7 @@ def train(
     (.safetensors) to go on from in place of random ones. Raises SettingsError, InputError.
     """
     from brmgeo.segment import train as engine
-    from brmgeo.segment.encoder import imagenet_weights
+    from brmgeo.segment.imagenet import imagenet_weights
     from brmgeo.segment.unet import UNetSettings
     from brmgeo.segment.weights import load_weights
 

@@ -28,6 +28,7 @@ KERNELS = {
     "brmgeo.flight.klt",
     "brmgeo.flight.planar",
     "brmgeo.segment.unet",
+    "brmgeo.segment.encoder",
     "brmgeo.segment.augment",
     "brmgeo.segment.metrics",
     "brmgeo.segment.tiles",

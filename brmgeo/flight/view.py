@@ -11,15 +11,23 @@ import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import cv2
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.flight.camera import border_pixels, level_from_camera, ray_from_pixel
+from brmgeo.flight.camera import (
+    border_pixels,
+    ground_from_pixel,
+    level_from_camera,
+    pixel_from_point,
+    ray_from_pixel,
+)
 from brmgeo.flight.readings import Attitude, Camera, FloatArray
 from brmgeo.flight.values import View
 
 MAX_SAMPLES = 8
+_ROWS = 256  # of a frame that are raised at a time
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -197,6 +205,35 @@ def make_view(
         radius_m=agl_m * camera.half_fov_tan,
         file=file,
     )
+
+
+def raised(
+    mask: NDArray[np.uint8], camera: Camera, rotation: FloatArray, agl_m: float, height_m: float, outside: int
+) -> NDArray[np.uint8]:
+    """(h, w) uint8 mask of what lies on the ground, as if it stood ``height_m`` above: where a camera sees the roofs.
+
+    Args:
+        rotation: (3, 3) world_from_camera, z upwards; any heading.
+        agl_m: height of the camera above ground.
+        height_m: of what stands, below the camera.
+        outside: what pixels get whose ground lies beyond the frame.
+    """
+    h, w = mask.shape
+    at = np.array([0.0, 0.0, agl_m])
+    out = np.empty_like(mask)
+    for top in range(0, h, _ROWS):
+        v, u = np.mgrid[top : min(top + _ROWS, h), :w].astype(np.float64)
+        xy = ground_from_pixel(camera, rotation, at, np.dstack([u, v]), height_m)
+        source = pixel_from_point(camera, rotation, at, np.dstack([xy, np.zeros(u.shape)]))
+        out[top : top + _ROWS] = cv2.remap(
+            mask,
+            np.nan_to_num(source, nan=-10.0).astype(np.float32),
+            None,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=outside,
+        )
+    return out
 
 
 class Features(NamedTuple):

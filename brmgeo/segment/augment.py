@@ -26,6 +26,7 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 #: Of red, green and blue, 0 to 1: what the network's input is normalised with, and what stands where nothing was seen.
 MEAN, STD = (0.45, 0.45, 0.42), (0.22, 0.21, 0.21)
+_LUMA = (0.3, 0.59, 0.11)  # of red, green and blue in grey
 _ROOFS = np.array(  # light and dark grey, brown, beige, brick, slate blue, white: shingles, tiles, metal of many countries
     [
         (188, 188, 184), (150, 150, 148), (104, 102, 100), (70, 68, 68), (122, 100, 84), (96, 78, 66),
@@ -225,9 +226,7 @@ def recolour(image: U8, label: U8, gsd_m: float, rng: np.random.Generator, setti
         img = _colour(img, settings.colour, rng)
     if settings.grey > 0 and rng.random() < settings.grey:
         left = np.float32(rng.uniform(0, 0.4))
-        img = (
-            left * img + (1 - left) * cv2.transform(img, np.array([[0.3, 0.59, 0.11]], np.float32))[..., None]
-        )
+        img = left * img + (1 - left) * cv2.transform(img, np.array([_LUMA], np.float32))[..., None]
     if rng.random() < settings.shadow:
         img = _shadow(img, rng)
     if rng.random() < settings.haze:
@@ -261,7 +260,7 @@ def _roofs(img: F32, label: U8, rng: np.random.Generator) -> F32:
     colours = (colours + rng.normal(0, 12, (count, 3))).astype(np.float32)
     keep = rng.uniform(0.0, 0.4, (count, 1)).astype(np.float32)
     flat = parts.ravel()
-    grey = img @ np.array([0.3, 0.59, 0.11], np.float32)
+    grey = img @ np.array(_LUMA, np.float32)
     area = np.maximum(np.bincount(flat, minlength=count), 1)
     mean = np.bincount(flat, grey.ravel(), count) / area
     # A roof's own light and shade about its mean, at most doubled: near-black roofs hold little but noise.
@@ -374,7 +373,7 @@ def _colour(img: F32, strength: float, rng: np.random.Generator) -> F32:
     turn = rng.normal(0, 0.12 * s)
     c, q, third = math.cos(turn), math.sin(turn) / math.sqrt(3), (1 - math.cos(turn)) / 3
     hue = np.full((3, 3), third) + c * np.eye(3) + q * np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]])
-    grey = np.tile([0.3, 0.59, 0.11], (3, 1))
+    grey = np.tile(_LUMA, (3, 1))
     matrix = (saturation * np.eye(3) + (1 - saturation) * grey) @ hue @ np.diag(gain)
     img = cv2.transform(img.astype(np.float32), matrix.astype(np.float32))
     contrast = math.exp(rng.normal(0, 0.15 * s))

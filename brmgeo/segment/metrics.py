@@ -175,8 +175,8 @@ def ring_features(mask: NDArray[np.bool_], known: NDArray[np.bool_], n: int = 3)
 class LogitHistogram:
     """How often each logit was given to buildings and to other ground; all that calibration and threshold need.
 
-    ``add`` frames of validation, then ``temperature``, ``best_threshold`` and ``reliability``. Logits beyond +-``LIMIT``
-    count as that; bins are 0.05 wide, so what follows is exact to 0.6 % of probability.
+    ``add`` frames of validation, then ``temperature`` and ``reliability``, and ``best_threshold`` of several. Logits
+    beyond +-``LIMIT`` count as that; bins are 0.05 wide, so what follows is exact to 0.6 % of probability.
     """
 
     LIMIT = 16.0
@@ -220,10 +220,6 @@ class LogitHistogram:
         false = self.other[::-1].cumsum()[::-1]
         union = self.building.sum() + np.append(false[1:], 0)
         return np.asarray(np.append(hit[1:], 0) / np.maximum(union, 1), np.float64)
-
-    def best_threshold(self, temperature: float) -> float:
-        """The calibrated probability above which building has the highest IoU; 0.5 without both classes."""
-        return best_threshold([self], temperature)
 
     def reliability(
         self, temperature: float

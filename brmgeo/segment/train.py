@@ -35,7 +35,7 @@ from torch.nn import functional
 
 from brmgeo.errors import InputError, SettingsError
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, draw_crop
-from brmgeo.segment.encoder import imagenet_weights, start_from_imagenet
+from brmgeo.segment.imagenet import imagenet_weights, start_from_imagenet
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
 from brmgeo.segment.unet import UNet, UNetSettings
 

@@ -160,7 +160,12 @@ def test_two_identical_districts_stay_ambiguous() -> None:
 @pytest.mark.parametrize(("method", "seed"), [("mask", 98), ("mask", 99), ("ratio", 99)])
 def test_a_wrong_map_never_gives_a_place(method: str, seed: int) -> None:
     f = flight(town(seed))
-    assert all(e.position is None for e in run(make_matcher(method, GROUND, QUICK), f))
+    estimates = run(make_matcher(method, GROUND, QUICK), f)
+    assert all(e.position is None for e in estimates)
+    if method == "mask":
+        # A random town of equal houses has corners that look like another's: then, for a while, it is ambiguous.
+        assert sum(e.status == "lost" for e in estimates) >= 5
+        assert estimates[-1].extra["off_map"] > 0.8
 
 
 RESEMBLES = pytest.mark.xfail(strict=True, reason="resembles for a while: ends ambiguous, 0.86 off the map")

