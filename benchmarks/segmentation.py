@@ -3,7 +3,8 @@
     python benchmarks/segmentation.py [--weights FILE] [--rounds 9] [--threads 2] [--write docs/segmentation-runtime.md]
 
 All backends in one process, one frame each in turn, so that a busy machine slows all of them alike; medians, and ratios to
-torch float32. What runs the network is timed alone: normalised picture in, probability out. Agreement is measured on
+torch float32. What runs the network is timed alone, one look: normalised picture in, probability out; below the table, the
+whole of what `brmgeo segment` does with a frame, by one look and by two. Agreement is measured on
 generated scenes, on rendered frames of ``--frames`` where given, and on the frames of the real flight in BRMGEO_REAL_DATA
 (default ../shared/data) where that is there. int8 is calibrated on other pictures than it is measured on.
 """
@@ -28,7 +29,7 @@ import torch
 
 from brmgeo.geo.grid import lattice
 from brmgeo.segment.onnx_export import check_seal
-from brmgeo.segment.predict import SHIPPED
+from brmgeo.segment.predict import SHIPPED, Segmenter
 from brmgeo.segment.weights import load_network
 from brmgeo.synth.imagery import render_imagery
 from brmgeo.synth.town import generate_town
@@ -188,12 +189,20 @@ def main() -> None:
         runs += onnx_runs(args.weights.with_suffix(".onnx"), args.threads, calibration, Path(scratch))
         x = pictures["generated"][0]
         seconds: dict[str, list[float]] = {name: [] for name, _, _ in runs}
+        graph = args.weights.with_suffix(".onnx")
+        segmenters = {k: Segmenter.load(graph, "onnx", args.threads, looks=k) for k in (1, 2)}
+        whole: dict[int, list[float]] = {k: [] for k in segmenters}
         for round_ in range(args.rounds + 1):
             for name, run, _ in runs:
                 start = time.perf_counter()
                 run(x)
                 if round_:  # the first warms up
                     seconds[name].append(time.perf_counter() - start)
+            for looks, segmenter in segmenters.items():
+                start = time.perf_counter()
+                segmenter.probability(sets["generated"][0])
+                if round_:
+                    whole[looks].append(time.perf_counter() - start)
         truth = {name: [runs[0][1](p) for p in those] for name, those in pictures.items()}
         base = float(np.median(seconds[runs[0][0]]))
         head = [
@@ -224,6 +233,11 @@ def main() -> None:
                 ]
             )
     table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    one, two = (1000 * float(np.median(whole[k])) for k in (1, 2))
+    table += (
+        f"\n\nA frame of {SIDE} x {SIDE} px from picture to probability, ONNX Runtime: {one:.0f} ms by one look, "
+        f"{two:.0f} ms by two ({two / one:.2f} times)."
+    )
     print(table)
     if args.write:
         text = args.write.read_text(encoding="utf-8")

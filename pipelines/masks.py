@@ -37,6 +37,7 @@ from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.geo.grid import Window
 from brmgeo.segment.predict import (
+    LOOKS,
     OVERLAP_PX,
     WINDOW_PX,
     Gsd,
@@ -112,6 +113,7 @@ class NetworkUse:
             right from wrong two to four times as clearly as with probabilities, and lies as near to the truth.
         cache: folder in which answers are kept; None keeps none beyond the run.
         roof_m: height above ground of the roofs it finds.
+        looks: how often it looks at a frame, see ``Segmenter.load``.
     """
 
     wanted: Literal["given", "network"] = "given"
@@ -119,6 +121,7 @@ class NetworkUse:
     answer: Answer = "mask"
     cache: Path | None = None
     roof_m: float = ROOF_M
+    looks: int = LOOKS
 
     def asks_network(self, flight: Flight) -> bool:
         """True where the network is to make the masks of a flight."""
@@ -144,7 +147,7 @@ def frame_masks(
         raise MissingInputError(
             f"{flight.folder}: the network is to make masks, but the flight has no frames; put them into frames/"
         )
-    segmenter = Segmenter.load(use.weights)
+    segmenter = Segmenter.load(use.weights, looks=use.looks)
     if warning := trained_over(segmenter.card, region):
         progress.say(f"{flight.name}: {warning}")
     with tempfile.TemporaryDirectory(prefix="brmgeo-masks-") as scratch:
@@ -152,7 +155,8 @@ def frame_masks(
         threshold = segmenter.card.threshold if use.answer == "mask" else None
         runs = {"onnx": "ONNX Runtime", "torch": "torch"}[segmenter.backend]
         shown = "probabilities" if threshold is None else f"masks above {threshold:g}"
-        source = f"network {segmenter.name} ({runs}), {shown}, roofs at {use.roof_m:g} m"
+        seen = "" if segmenter.looks == LOOKS else ", one look"
+        source = f"network {segmenter.name} ({runs}){seen}, {shown}, roofs at {use.roof_m:g} m"
         yield FrameMasks(flight, source, files, threshold, use.roof_m)
 
 
@@ -279,7 +283,12 @@ def _ask(flight: Flight, segmenter: Segmenter, cache: Path, progress: Progress) 
 
 def _key(data: bytes, segmenter: Segmenter, picture: Picture, gsd_m: float) -> Path:
     size = segmenter.working_size((picture.rgb.shape[0], picture.rgb.shape[1]), gsd_m)
-    settings = {"format": _FORMAT, "weights": segmenter.card.sha256, "backend": segmenter.backend}
+    settings = {
+        "format": _FORMAT,
+        "weights": segmenter.card.sha256,
+        "backend": segmenter.backend,
+        "looks": segmenter.looks,
+    }
     text = json.dumps({**settings, "frame": hashlib.sha256(data).hexdigest(), "size": size}, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()
     return Path(key[:2]) / f"{key[2:40]}.png"
@@ -328,6 +337,7 @@ def segment(
     gsd_m: float | None = None,
     levels: tuple[float, float] | None = None,
     bands: tuple[int, ...] | None = None,
+    looks: int = LOOKS,
 ) -> str:
     """Masks of a flight's frames, of a folder of images, or of one raster; returns what was done, for people.
 
@@ -339,6 +349,7 @@ def segment(
         gsd_m: metres per pixel of images in a plain folder; flights and rasters know theirs.
         levels: the levels that are black and white in images of more than 8 bits.
         bands: red, green and blue band of a raster, from 1.
+        looks: how often the network looks at a picture, see ``Segmenter.load``.
     """
     if levels is not None and not (all(map(math.isfinite, levels)) and levels[0] < levels[1]):
         raise SettingsError(f"--levels {levels[0]:g},{levels[1]:g}: give black, then a higher white")
@@ -351,7 +362,7 @@ def segment(
         raise SettingsError(f"--gsd goes with a plain folder of images; {source} says its own")
     if levels is not None and flight:
         raise SettingsError("--levels goes with rasters and plain folders; a flight's frames have 8 bits")
-    segmenter = Segmenter.load(weights, backend)
+    segmenter = Segmenter.load(weights, backend, looks=looks)
     if not source.is_dir():
         return segment_raster(source, out, segmenter, answer, levels=levels, bands=bands)
     pictures = _flight_pictures(source) if flight else _folder_pictures(source, gsd_m, levels)
@@ -402,6 +413,7 @@ def _segment_pictures(
         "weights": segmenter.card.sha256,
         "network": segmenter.name,
         "backend": segmenter.backend,
+        "looks": segmenter.looks,
         "threshold": segmenter.card.threshold,
         "images": len(jobs),
         "finished": False,
@@ -475,6 +487,7 @@ def segment_raster(
                         "NETWORK": segmenter.name,
                         "WEIGHTS_SHA256": segmenter.card.sha256,
                         "THRESHOLD": repr(segmenter.card.threshold),
+                        "LOOKS": str(segmenter.looks),
                     },
                 )[0]
     except RasterioError as error:

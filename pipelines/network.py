@@ -611,7 +611,7 @@ def train(
     initial, before = load_weights(start) if start is not None else (None, None)
     if settings.imagenet and initial is None and not engine.checkpoint_of(out).exists():
         imagenet_weights()
-    ground = gather(recipe, data, paths or {}, test_regions, augment.gsd_m[0], say)
+    ground = gather(recipe, data, paths or {}, test_regions, augment.finest_m, say)
     crops = engine.validation_crops(
         [s for _, s in ground.crops], recipe.validation_crops, settings.crop_px, recipe.work_gsd_m
     )
@@ -691,34 +691,23 @@ def finish(
     weights = out / "model.safetensors"
     tensors = tensors_of(state)
     save_weights(weights, tensors, card)
-    raw = Segmenter.load(weights, "torch")
-    # Every kind of validation ground counts the same, whatever its area.
-    histogram, parts = LogitHistogram(), []
-    for pictures in ground.validation.values():
-        own = LogitHistogram()
-        for picture in pictures:
-            image, label = picture.read()
-            p = np.clip(raw.probability(image, picture.gsd_m).astype(np.float64), 1e-7, 1 - 1e-7)
-            own.add(np.log(p / (1 - p)).astype(np.float32), label)
-        parts.append(own)
-    most = max(int((h.building + h.other).sum()) for h in parts)
-    for own in parts:
-        times = most / max(int((own.building + own.other).sum()), 1)
-        histogram.building += np.rint(own.building * times).astype(np.int64)
-        histogram.other += np.rint(own.other * times).astype(np.int64)
-    temperature = histogram.temperature()
-    card = replace(
-        card, temperature=round(temperature, 4), threshold=round(best_threshold(parts, temperature), 3)
-    )
+    before = _histograms(Segmenter.load(weights, "torch"), ground.validation)
+    temperature = _weighed(before).temperature()
+    card = replace(card, temperature=round(temperature, 4))
+    save_weights(weights, tensors, card)
+    # A mean of two looks is no function of one temperature: the threshold is chosen on what comes out with it.
+    segmenter = Segmenter.load(weights, "torch")
+    after = _histograms(segmenter, ground.validation)
+    card = replace(card, threshold=round(best_threshold(after), 3))
     calibration = {
+        "looks": segmenter.looks,
         "temperature": card.temperature,
         "threshold": card.threshold,
-        "calibration_error_before": round(histogram.calibration_error(1.0), 4),
-        "calibration_error": round(histogram.calibration_error(temperature), 4),
+        "calibration_error_before": round(_weighed(before).calibration_error(), 4),
+        "calibration_error": round(_weighed(after).calibration_error(), 4),
     }
     say(f"calibrated on validation: temperature {card.temperature}, threshold {card.threshold}")
-    save_weights(weights, tensors, card)
-    segmenter = Segmenter.load(weights, "torch")
+    segmenter = replace(segmenter, card=card)
     scores = {
         # What cannot be told of a source (features of frames without room for a disc) is left out.
         f"{split}: {name}{height}": {k: v for k, v in own.summary().items() if math.isfinite(v)}
@@ -733,8 +722,35 @@ def finish(
     card = replace(card, metrics={"calibration": calibration, **scores})
     save_weights(weights, tensors, card)
     export_onnx(weights, out / "model.onnx")
-    _draw_reliability(out / "reliability.png", histogram, temperature)
+    _draw_reliability(
+        out / "reliability.png",
+        {"as trained": _weighed(before), f"temperature {card.temperature:.2f}": _weighed(after)},
+    )
     return {"calibration": calibration, "scores": scores}
+
+
+def _histograms(segmenter: Any, validation: Mapping[str, Sequence[Picture]]) -> list[LogitHistogram]:
+    """What a ``Segmenter`` says of each kind of validation ground."""
+    parts = []
+    for pictures in validation.values():
+        own = LogitHistogram()
+        for picture in pictures:
+            image, label = picture.read()
+            p = np.clip(segmenter.probability(image, picture.gsd_m).astype(np.float64), 1e-7, 1 - 1e-7)
+            own.add(np.log(p / (1 - p)).astype(np.float32), label)
+        parts.append(own)
+    return parts
+
+
+def _weighed(parts: Sequence[LogitHistogram]) -> LogitHistogram:
+    """All kinds of ground in one, each counting the same, whatever its area."""
+    whole = LogitHistogram()
+    most = max(int((h.building + h.other).sum()) for h in parts)
+    for own in parts:
+        times = most / max(int((own.building + own.other).sum()), 1)
+        whole.building += np.rint(own.building * times).astype(np.int64)
+        whole.other += np.rint(own.other * times).astype(np.int64)
+    return whole
 
 
 def score(segmenter: Any, pictures: Sequence[Picture]) -> dict[str, Scores]:
@@ -800,14 +816,14 @@ def write_curves(out: Path, epochs: Sequence[Mapping[str, Any]]) -> None:
     part.replace(out / "curves.png")
 
 
-def _draw_reliability(path: Path, histogram: LogitHistogram, temperature: float) -> None:
+def _draw_reliability(path: Path, histograms: Mapping[str, LogitHistogram]) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2, 4.0), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="0.7", lw=1)
-    for t, name in ((1.0, "as trained"), (temperature, f"temperature {temperature:.2f}")):
-        said, was, _ = histogram.reliability(t)
+    for name, histogram in histograms.items():
+        said, was, _ = histogram.reliability()
         axes.plot(said, was, marker="o", ms=4, label=name)
     axes.set(
         xlabel="probability said", ylabel="share that is building", xlim=(0, 1), ylim=(0, 1), aspect="equal"

@@ -26,6 +26,7 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 #: Of red, green and blue, 0 to 1: what the network's input is normalised with, and what stands where nothing was seen.
 MEAN, STD = (0.45, 0.45, 0.42), (0.22, 0.21, 0.21)
+_LARGEST = 2.0  # how many times larger the ground is shown at most, where it is
 _LUMA = (0.3, 0.59, 0.11)  # of red, green and blue in grey
 _ROOFS = np.array(  # light and dark grey, brown, beige, brick, slate blue, white: shingles, tiles, metal of many countries
     [
@@ -45,6 +46,8 @@ class AugmentSettings:
         turn: any rotation and mirror image; False keeps north up.
         tilt: largest movement of a crop's corner, as a share of its side (perspective).
         near_buildings: share of crops that are centred near a building.
+        enlarge: probability that the ground is shown larger than it is, up to twice as far as its source's pixels go: houses
+            as large as halls.
         roofs: probability that roofs get other colours, building by building.
         objects: probability that courts, pools and paved squares are drawn on open ground.
         colour: strength of changes of brightness, contrast, gamma, white balance, saturation and hue; 1 is strong.
@@ -56,6 +59,7 @@ class AugmentSettings:
     turn: bool = True
     tilt: float = 0.10
     near_buildings: float = 0.5
+    enlarge: float = 0.0
     roofs: float = 0.4
     objects: float = 0.2
     colour: float = 0.8
@@ -72,7 +76,9 @@ class AugmentSettings:
             raise SettingsError(
                 f"augmentation gsd_m {self.gsd_m}: give (finest, coarsest), finest above 0 and not above coarsest"
             )
-        for name in ("near_buildings", "roofs", "objects", "grey", "shadow", "haze", "blur", "noise", "jpeg"):
+        for name in (
+            "near_buildings", "enlarge", "roofs", "objects", "grey", "shadow", "haze", "blur", "noise", "jpeg",
+        ):  # fmt: skip
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"augmentation {name} {getattr(self, name)}: give a probability, 0 to 1")
         if not 0 <= self.tilt <= 0.3 or not 0 <= self.colour <= 2:
@@ -83,7 +89,12 @@ class AugmentSettings:
     @staticmethod
     def none(gsd_m: float) -> AugmentSettings:
         """Crops at one GSD, north up, with nothing changed: for validation."""
-        return AugmentSettings((gsd_m, gsd_m), False, 0.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        return AugmentSettings((gsd_m, gsd_m), False, 0.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+
+    @property
+    def finest_m(self) -> float:
+        """The finest metres per pixel that are cut from a source."""
+        return self.gsd_m[0] / (_LARGEST if self.enlarge > 0 else 1.0)
 
 
 class Source(Protocol):
@@ -113,6 +124,8 @@ def draw_crop(
     # Half the diagonal, and what tilting moves a corner outwards.
     reach = size_px * gsd * (math.sqrt(0.5) + math.sqrt(2) * settings.tilt) + 1.0
     image, label, source_gsd, centre = source.patch(rng, reach, settings.near_buildings, gsd)
+    if settings.enlarge > 0 and rng.random() < settings.enlarge:
+        gsd = min(gsd, max(source_gsd, gsd / float(rng.uniform(1.0, _LARGEST))))
     image, label = cut(image, label, centre, _crop_quad(rng, size_px, gsd / source_gsd, settings), size_px)
     plain = (image == 0).all(-1) | (image == 255).all(-1)
     image = recolour(image, label, gsd, rng, settings)

@@ -222,7 +222,7 @@ class LogitHistogram:
         return np.asarray(np.append(hit[1:], 0) / np.maximum(union, 1), np.float64)
 
     def reliability(
-        self, temperature: float
+        self, temperature: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """(mean probability, share of building, pixels) of RELIABILITY_BINS equal bins of probability; NaN in empty ones."""
         p = 1 / (1 + np.exp(-self.logits / temperature))
@@ -234,14 +234,14 @@ class LogitHistogram:
             was = np.bincount(index, self.building, RELIABILITY_BINS) / count
         return said, was, count.astype(np.int64)
 
-    def calibration_error(self, temperature: float) -> float:
+    def calibration_error(self, temperature: float = 1.0) -> float:
         """Expected calibration error: mean over pixels of |share of building - probability| of their bin."""
         said, was, count = self.reliability(temperature)
         filled = count > 0
         return float((np.abs(said - was)[filled] * count[filled]).sum() / max(int(count.sum()), 1))
 
 
-def best_threshold(grounds: Sequence[LogitHistogram], temperature: float) -> float:
+def best_threshold(grounds: Sequence[LogitHistogram], temperature: float = 1.0) -> float:
     """The calibrated probability above which building has the highest mean of the grounds' IoUs.
 
     A mean of IoUs, not the IoU of all pixels: else the ground with the most building would choose alone. Grounds without

@@ -106,10 +106,10 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
 ) -> None:
     cache = tmp_path / "cache"
 
-    def ask(folder: Path, weights_file: Path) -> list[bytes]:
+    def ask(folder: Path, weights_file: Path, looks: int = 2) -> list[bytes]:
         asked.clear()
         flight = job.read_flight(folder)
-        use = job.NetworkUse(weights=weights_file, cache=cache)
+        use = job.NetworkUse(weights=weights_file, cache=cache, looks=looks)
         with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
             return [masks.image(i).tobytes() for i in range(len(flight.frames))]
 
@@ -134,6 +134,8 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
     assert len(asked) == len(first), "from another height the frames are resampled"
     ask(pictured, bright_onnx(tmp_path / "other.onnx", small_card(sha256="cd" * 32)))
     assert len(asked) == len(first)
+    assert ask(pictured, weights, looks=1) != first
+    assert len(asked) == len(first), "one look is another answer"
 
 
 @pytest.mark.parametrize("answer", ["mask", "probability"])
@@ -400,10 +402,11 @@ def test_a_raster_in_windows_is_as_the_whole(
 ) -> None:
     image = town(700, 1300)
     raster = write_raster(tmp_path / "in.tif", image)
-    whole = Segmenter.load(weights).probability(image)
+    # Once: the second look's coarser pixels lie elsewhere in a window than in the whole.
+    whole = Segmenter.load(weights, looks=1).probability(image)
     monkeypatch.setattr(job, "WINDOW_PX", 256)
     monkeypatch.setattr(job, "OVERLAP_PX", 64)
-    words = ("segment", raster, "--weights", weights, "--out")
+    words = ("segment", raster, "--weights", weights, "--looks", "1", "--out")
     said = say(*words, tmp_path / "p.tif", "--as", "probability")
     assert said.code == 0, said.err
     assert "1300 x 700 px of 0.5 m" in said.out

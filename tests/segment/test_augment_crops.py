@@ -155,6 +155,29 @@ def test_jpeg_keeps_each_colour_in_its_channel() -> None:
     assert lost[1] > lost[0]
 
 
+@pytest.mark.parametrize(("source_gsd_m", "widest"), [(0.1, 80), (0.3, 54), (0.4, 40)])
+def test_ground_is_shown_up_to_twice_as_large_but_not_beyond_its_own_pixels(
+    source_gsd_m: float, widest: int
+) -> None:
+    """A building of 16 m is 40 px wide at 0.4 m, and at most as wide as twice that or its own pixels say."""
+    half = round(8 / source_gsd_m)
+    label = np.zeros((round(60 / source_gsd_m),) * 2, np.uint8)
+    middle = len(label) // 2
+    label[middle - half : middle + half, middle - half : middle + half] = 255
+    source = Scenes([Scene(np.zeros((*label.shape, 3), np.uint8), label, source_gsd_m)])
+    larger = dataclasses.replace(AugmentSettings.none(0.4), near_buildings=1.0, enlarge=1.0)
+    assert larger.finest_m == pytest.approx(0.2)
+    widths = []
+    for seed in range(150):
+        _, seen = draw_crop(source, np.random.default_rng(seed), 192, larger)
+        across = (seen == 255).any(0)
+        if not (across[0] or across[-1]):
+            widths.append(int(across.sum()))
+    assert len(widths) > 50
+    assert min(widths) == pytest.approx(40, abs=1 + 0.06 * (widest - 40))
+    assert max(widths) == pytest.approx(widest, abs=1 + 0.06 * (widest - 40))
+
+
 @pytest.mark.parametrize(
     "bad", [{"gsd_m": (0.4, 0.2)}, {"gsd_m": (0.0, 0.2)}, {"haze": 1.5}, {"tilt": 0.5}, {"colour": -1.0}]
 )
