@@ -595,7 +595,12 @@ def train(
     settings = _settings(engine.TrainSettings, recipe.training, "training")
     augment = _settings(AugmentSettings, recipe.augment, "augment")
     if steps is not None:
-        settings = replace(settings, steps=steps, warmup_steps=min(settings.warmup_steps, steps // 4))
+        settings = replace(
+            settings,
+            steps=steps,
+            warmup_steps=min(settings.warmup_steps, steps // 4),
+            mean_from=min(settings.mean_from, steps),
+        )
     if unet.in_channels != 3:
         raise SettingsError(
             f"recipe, [unet]: in_channels {unet.in_channels}: pictures have 3, red, green and blue"
@@ -658,12 +663,18 @@ def train(
 
     run = trainer.train(on_epoch, on_step)
     best = run.best_epoch
-    say(f"trained: {run.step} steps, best epoch {best.epoch if best else 0}")
+    averaged = [e.epoch for e in run.history if settings.mean_from and e.step >= settings.mean_from]
+    kept = (
+        f"the mean of epochs {averaged[0]} to {averaged[-1]}"
+        if averaged
+        else f"epoch {best.epoch if best else 0}"
+    )
+    say(f"trained: {run.step} steps, kept: {kept}")
     facts = finish(run.best, unet, recipe, augment, ground, out, say, run.step)
     facts["training"] = {
         "recipe": recipe_path.stem,
         "steps": run.step,
-        "best_epoch": best.epoch if best else 0,
+        "kept": kept,
         "seconds_of_this_run": round(time.monotonic() - started),
         "device": trainer.device.type,
     }

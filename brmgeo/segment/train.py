@@ -8,7 +8,7 @@ file that replaces the one before atomically.
 
 AdamW (Loshchilov and Hutter 2019) under a cosine schedule with linear warm-up; binary cross-entropy plus a Tversky term
 (Salehi et al. 2017; soft Dice where both of its weights are one half) against the imbalance of buildings and ground;
-an exponential moving average of all weights, which is what is validated and kept.
+an exponential moving average of all weights, which is what is validated, and of the best epoch or as a mean of many is kept.
 """
 
 from __future__ import annotations
@@ -58,6 +58,8 @@ class TrainSettings:
         encoder_lr: the same of a ``efficientnet-lite0`` encoder, as a share of lr: less keeps more of what it knew.
         weight_decay: of convolution weights; norms and biases have none.
         ema: decay of the moving average of the weights, a step.
+        mean_from: the step from which on the weights that are kept are the plain mean of all epochs' moving averages (Izmailov
+            et al. 2018; Cha et al. 2021: flatter, and better on ground of another kind); 0: those of the best epoch.
         overlap_weight: of the Tversky term, beside cross-entropy's 1.
         false_positives, false_negatives: weights of the two errors in the Tversky term.
         epoch_steps: steps between validations.
@@ -84,6 +86,7 @@ class TrainSettings:
     encoder_lr: float = 1.0
     weight_decay: float = 0.01
     ema: float = 0.995
+    mean_from: int = 0
     overlap_weight: float = 0.5
     false_positives: float = 0.5
     false_negatives: float = 0.5
@@ -100,7 +103,7 @@ class TrainSettings:
         for name in whole:
             if getattr(self, name) < 1:
                 raise SettingsError(f"training {name} {getattr(self, name)}: give 1 or more")
-        for name in ("seed", "stop_after", "patience", "threads"):
+        for name in ("seed", "stop_after", "mean_from", "patience", "threads"):
             if getattr(self, name) < 0:
                 raise SettingsError(f"training {name} {getattr(self, name)}: give 0 or more")
         if not 0 < self.encoder_lr <= 1:
@@ -111,6 +114,10 @@ class TrainSettings:
             raise SettingsError(
                 f"training lr {self.lr}, ema {self.ema}, warmup_steps {self.warmup_steps}: lr lies in (0, 1), "
                 f"ema in [0, 1), the warm-up within the {self.steps} steps"
+            )
+        if self.mean_from and self.mean_from > min(self.steps, self.stop_after or self.steps):
+            raise SettingsError(
+                f"training mean_from {self.mean_from}: the run ends before it; give a step within it, or 0"
             )
         if self.compile and not shutil.which(os.environ.get("CXX", "g++")):
             raise SettingsError(
@@ -415,7 +422,12 @@ class Trainer:
         )
         run.history.append(epoch)
         run.losses.clear()
-        if before is None or loss < before.validation_loss:
+        first = self._settings.mean_from
+        if first and run.step >= first:
+            run.best = mean_with(
+                run.best, run.average.state_dict(), sum(e.step >= first for e in run.history)
+            )
+        elif before is None or loss < before.validation_loss:
             run.best = _copy(run.average.state_dict())
         return np.asarray(1 / (1 + np.exp(-logits)), np.float32)
 
@@ -491,6 +503,15 @@ class Trainer:
             raise InputError(
                 f"{path}: is not a whole checkpoint ({' '.join(str(error).split())[:100]}); delete it to begin again"
             ) from None
+
+
+def mean_with(mean: Mapping[str, Tensor], state: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
+    """The mean of ``count`` states of weights: of the last one and the mean of those before it (unused where it is the first)."""
+    new = _copy(state)
+    for name, tensor in new.items():
+        if count > 1 and tensor.is_floating_point():
+            new[name] = torch.lerp(mean[name], tensor, 1.0 / count)
+    return new
 
 
 def _copy(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

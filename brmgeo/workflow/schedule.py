@@ -94,6 +94,7 @@ class _Dask:
             return
         client = self._start()
         from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
 
         threads = max(1, sum(client.nthreads().values()))
         waiting = iter(work)
@@ -113,7 +114,8 @@ class _Dask:
                 f"most often for lack of memory; use smaller blocks or SCHEDULER=serial, see {self._shared / 'dask.log'}"
             ) from None
         except (CancelledError, TimeoutError, OSError) as error:
-            if client.status == "running" and not isinstance(error, CancelledError):
+            # An item's own errors pass; a connection that broke a moment before the client notices is the scheduler's end.
+            if client.status == "running" and not isinstance(error, CancelledError | CommClosedError):
                 raise
             raise WorkflowError(
                 f"{_name(function)}: the scheduler {self._address or 'of this machine'} went away; start it and run again"

@@ -179,7 +179,15 @@ def test_ground_is_shown_up_to_twice_as_large_but_not_beyond_its_own_pixels(
 
 
 @pytest.mark.parametrize(
-    "bad", [{"gsd_m": (0.4, 0.2)}, {"gsd_m": (0.0, 0.2)}, {"haze": 1.5}, {"tilt": 0.5}, {"colour": -1.0}]
+    "bad",
+    [
+        {"gsd_m": (0.4, 0.2)},
+        {"gsd_m": (0.0, 0.2)},
+        {"haze": 1.5},
+        {"enlarge": 1.5},
+        {"tilt": 0.5},
+        {"colour": -1.0},
+    ],
 )
 def test_strengths_out_of_range_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(SettingsError, match="augmentation"):

@@ -78,6 +78,34 @@ def test_a_killed_run_ends_as_one_that_was_not(tmp_path: Path, crops: Any, kille
         assert torch.equal(tensor, state_of(resumed)[name]), name
 
 
+@pytest.mark.parametrize("killed_at", [3, 5, 7])
+def test_the_mean_of_late_epochs_is_kept_through_a_kill(tmp_path: Path, crops: Any, killed_at: int) -> None:
+    settings = dataclasses.replace(SETTINGS, epoch_steps=2, mean_from=4)
+    epochs: list[dict[str, torch.Tensor]] = []
+
+    def keep(run: Run, probability: np.ndarray) -> None:
+        if run.step >= 4:
+            epochs.append({k: t.clone().double() for k, t in run.average.state_dict().items()})
+
+    whole = trainer(tmp_path / "whole", crops, settings).train(on_epoch=keep)
+    assert len(epochs) == 3
+    for name, tensor in whole.best.items():
+        mean = sum(e[name] for e in epochs) / 3
+        wanted = mean if tensor.is_floating_point() else epochs[-1][name]
+        torch.testing.assert_close(tensor.double(), wanted, atol=1e-6, rtol=1e-5)
+    assert any(not torch.equal(t, whole.average.state_dict()[n]) for n, t in whole.best.items())
+
+    def kill(step: int, loss: float) -> None:
+        if step == killed_at:
+            raise Killed
+
+    with pytest.raises(Killed):
+        trainer(tmp_path / "killed", crops, settings).train(on_step=kill)
+    resumed = trainer(tmp_path / "killed", crops, settings).train()
+    for name, tensor in state_of(whole).items():
+        assert torch.equal(tensor, state_of(resumed)[name]), name
+
+
 LITE = UNetSettings(widths=(8, 8, 8, 8, 8), encoder="efficientnet-lite0")
 LITE_SETTINGS = dataclasses.replace(
     SETTINGS,
@@ -306,7 +334,7 @@ def test_the_rate_rises_then_falls_to_a_hundredth() -> None:
 
 @pytest.mark.parametrize(
     "bad", [{"steps": 0}, {"lr": 0.0}, {"ema": 1.0}, {"warmup_steps": 2000}, {"device": "tpu"}, {"batch": 0}, {"seed": -1},
-     {"stop_after": -5}, {"encoder_lr": 0.0}, {"encoder_lr": 1.5}],
+     {"stop_after": -5}, {"mean_from": 2001}, {"encoder_lr": 0.0}, {"encoder_lr": 1.5}],
 )  # fmt: skip
 def test_settings_that_cannot_train_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(SettingsError, match="training"):
