@@ -58,8 +58,8 @@ class TrainSettings:
         encoder_lr: the same of a ``efficientnet-lite0`` encoder, as a share of lr: less keeps more of what it knew.
         weight_decay: of convolution weights; norms and biases have none.
         ema: decay of the moving average of the weights, a step.
-        mean_from: the step from which on the weights that are kept are the plain mean of all epochs' moving averages (Izmailov
-            et al. 2018; Cha et al. 2021: flatter, and better on ground of another kind); 0: those of the best epoch.
+        mean_from: the step from which on the weights that are kept are the plain mean of all epochs' moving averages
+            (Izmailov et al. 2018, Cha et al. 2021: better on ground of another kind); 0: those of the best epoch.
         overlap_weight: of the Tversky term, beside cross-entropy's 1.
         false_positives, false_negatives: weights of the two errors in the Tversky term.
         epoch_steps: steps between validations.
@@ -506,7 +506,7 @@ class Trainer:
 
 
 def mean_with(mean: Mapping[str, Tensor], state: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
-    """The mean of ``count`` states of weights: of the last one and the mean of those before it (unused where it is the first)."""
+    """The mean of ``count`` states of weights: of the last one, ``state``, and the ``mean`` of those before it."""
     new = _copy(state)
     for name, tensor in new.items():
         if count > 1 and tensor.is_floating_point():

@@ -94,7 +94,7 @@ class _Dask:
             return
         client = self._start()
         from distributed import CancelledError, KilledWorker
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
 
         threads = max(1, sum(client.nthreads().values()))
         waiting = iter(work)
