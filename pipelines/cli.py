@@ -41,9 +41,7 @@ weights_option = click.option(
 looks_option = click.option(
     "--looks",
     type=click.IntRange(1, 2),
-    default=2,
-    show_default=True,
-    help="How often the network looks at a picture: twice finds more, once takes 0.6 of the time.",
+    help="Looks of the network at a picture, 1 or 2 (default: as its weights say; the shipped ones 2).",
 )
 
 
@@ -531,7 +529,7 @@ def localize(
     weights: Path | None,
     answer: str | None,
     roof_m: float | None,
-    looks: int,
+    looks: int | None,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
     from pipelines import flights as job
@@ -554,7 +552,7 @@ def localize(
         answer or own_use.answer,  # type: ignore[arg-type]
         cache,
         own_use.roof_m if roof_m is None else roof_m,
-        looks,
+        looks=looks,
     )
     job.localize(
         folder,
@@ -716,7 +714,7 @@ def segment(
     gsd_m: float | None,
     levels: tuple[float, ...] | None,
     bands: tuple[float, ...] | None,
-    looks: int,
+    looks: int | None,
 ) -> None:
     """Find the buildings in SOURCE: a flight folder, a folder of images, or a georeferenced raster of any size."""
     from pipelines import masks as job

@@ -37,7 +37,6 @@ from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.geo.grid import Window
 from brmgeo.segment.predict import (
-    LOOKS,
     OVERLAP_PX,
     WINDOW_PX,
     Gsd,
@@ -113,7 +112,7 @@ class NetworkUse:
             right from wrong two to four times as clearly as with probabilities, and lies as near to the truth.
         cache: folder in which answers are kept; None keeps none beyond the run.
         roof_m: height above ground of the roofs it finds.
-        looks: how often it looks at a frame, see ``Segmenter.load``.
+        looks: how often it looks at a frame; None: as the weights' card says.
     """
 
     wanted: Literal["given", "network"] = "given"
@@ -121,7 +120,7 @@ class NetworkUse:
     answer: Answer = "mask"
     cache: Path | None = None
     roof_m: float = ROOF_M
-    looks: int = LOOKS
+    looks: int | None = None
 
     def asks_network(self, flight: Flight) -> bool:
         """True where the network is to make the masks of a flight."""
@@ -155,8 +154,7 @@ def frame_masks(
         threshold = segmenter.card.threshold if use.answer == "mask" else None
         runs = {"onnx": "ONNX Runtime", "torch": "torch"}[segmenter.backend]
         shown = "probabilities" if threshold is None else f"masks above {threshold:g}"
-        seen = "" if segmenter.looks == LOOKS else ", one look"
-        source = f"network {segmenter.name} ({runs}){seen}, {shown}, roofs at {use.roof_m:g} m"
+        source = f"network {segmenter.name} ({runs}), {shown}, roofs at {use.roof_m:g} m"
         yield FrameMasks(flight, source, files, threshold, use.roof_m)
 
 
@@ -337,7 +335,7 @@ def segment(
     gsd_m: float | None = None,
     levels: tuple[float, float] | None = None,
     bands: tuple[int, ...] | None = None,
-    looks: int = LOOKS,
+    looks: int | None = None,
 ) -> str:
     """Masks of a flight's frames, of a folder of images, or of one raster; returns what was done, for people.
 
@@ -349,7 +347,7 @@ def segment(
         gsd_m: metres per pixel of images in a plain folder; flights and rasters know theirs.
         levels: the levels that are black and white in images of more than 8 bits.
         bands: red, green and blue band of a raster, from 1.
-        looks: how often the network looks at a picture, see ``Segmenter.load``.
+        looks: how often the network looks at a picture, see ``Segmenter.load``; None: as its card says.
     """
     if levels is not None and not (all(map(math.isfinite, levels)) and levels[0] < levels[1]):
         raise SettingsError(f"--levels {levels[0]:g},{levels[1]:g}: give black, then a higher white")

@@ -664,17 +664,14 @@ def train(
     run = trainer.train(on_epoch, on_step)
     best = run.best_epoch
     averaged = [e.epoch for e in run.history if settings.mean_from and e.step >= settings.mean_from]
-    kept = (
-        f"the mean of epochs {averaged[0]} to {averaged[-1]}"
-        if averaged
-        else f"epoch {best.epoch if best else 0}"
-    )
-    say(f"trained: {run.step} steps, kept: {kept}")
+    kept = averaged or [best.epoch if best else 0]
+    told = f"the mean of epochs {kept[0]} to {kept[-1]}" if len(kept) > 1 else f"epoch {kept[0]}"
+    say(f"trained: {run.step} steps, kept: {told}")
     facts = finish(run.best, unet, recipe, augment, ground, out, say, run.step)
     facts["training"] = {
         "recipe": recipe_path.stem,
         "steps": run.step,
-        "kept": kept,
+        "epochs_kept": [kept[0], kept[-1]],
         "seconds_of_this_run": round(time.monotonic() - started),
         "device": trainer.device.type,
     }
@@ -688,7 +685,7 @@ def finish(
 ) -> dict[str, Any]:  # fmt: skip
     """Calibrates on validation frames, scores as ``brmgeo segment`` would answer, writes weights, card and ONNX."""
     from brmgeo.segment.onnx_export import export_onnx
-    from brmgeo.segment.predict import Segmenter
+    from brmgeo.segment.predict import LOOKS, Segmenter
     from brmgeo.segment.train import tensors_of
     from brmgeo.segment.weights import ModelCard, save_weights
 
@@ -702,12 +699,12 @@ def finish(
     weights = out / "model.safetensors"
     tensors = tensors_of(state)
     save_weights(weights, tensors, card)
-    before = _histograms(Segmenter.load(weights, "torch"), ground.validation)
-    temperature = _weighed(before).temperature()
-    card = replace(card, temperature=round(temperature, 4))
+    before = _histograms(Segmenter.load(weights, "torch", looks=LOOKS), ground.validation)
+    card = replace(card, temperature=round(_weighed(before).temperature(), 4))
     save_weights(weights, tensors, card)
-    # A mean of two looks is no function of one temperature: the threshold is chosen on what comes out with it.
-    segmenter = Segmenter.load(weights, "torch")
+    # The temperature that fits the mean of two looks goes into each of them, which is nearly the same: so the threshold is
+    # chosen, and the calibration's error taken, on what comes out.
+    segmenter = Segmenter.load(weights, "torch", looks=LOOKS)
     after = _histograms(segmenter, ground.validation)
     card = replace(card, threshold=round(best_threshold(after), 3))
     calibration = {

@@ -47,7 +47,8 @@ class AugmentSettings:
         tilt: largest movement of a crop's corner, as a share of its side (perspective).
         near_buildings: share of crops that are centred near a building.
         enlarge: probability that the ground is shown larger than it is, up to twice as far as its source's pixels go: houses
-            as large as halls.
+            as large as halls. A crop that shows half the ground may lose the building that it was centred near, and fine
+            sources are kept at twice the resolution: mosaics of them take four times the pixels.
         roofs: probability that roofs get other colours, building by building.
         objects: probability that courts, pools and paved squares are drawn on open ground.
         colour: strength of changes of brightness, contrast, gamma, white balance, saturation and hue; 1 is strong.

@@ -36,7 +36,7 @@ WINDOW_PX = 1024
 OVERLAP_PX = 128
 #: Pictures this many times coarser than anything in training hold no outline that could be found.
 MAX_COARSER = 4.0
-#: Looks at a picture, and how many times coarser the second one is: the farther view, at 0.64 of the first one's cost.
+#: Looks at a picture that weights are calibrated for, and how many times coarser the second one is.
 LOOKS, _COARSER = 2, 1.25
 _ALIGN = 32  # every network of at most six levels takes multiples of this
 
@@ -264,7 +264,11 @@ class Segmenter:
     backend: Backend
     path: Path
     _network: _Network
-    looks: int = LOOKS
+    looks: int
+
+    def __post_init__(self) -> None:
+        if self.looks not in (1, 2):
+            raise SettingsError(f"looks {self.looks}: give 1 or 2")
 
     @classmethod
     def load(
@@ -272,7 +276,7 @@ class Segmenter:
         path: Path | None = None,
         backend: str | None = None,
         threads: int | None = None,
-        looks: int = LOOKS,
+        looks: int | None = None,
     ) -> Segmenter:
         """The network of a file.
 
@@ -281,14 +285,12 @@ class Segmenter:
             backend: ``onnx`` (default) or ``torch``. With a .safetensors file ONNX Runtime runs the .onnx of the
                 same weights that lies beside it; where there is none, torch is the default.
             threads: processor threads; None for all cores.
-            looks: 2, which the card's threshold and scores are for: the answer is the mean of what the network says of
-                the picture and of its mirror image at 1.25 times its GSD; 1: of the picture alone, in 0.6 of the time.
+            looks: 2: the answer is the mean of what the network says of the picture and of its mirror image at 1.25 times
+                its GSD; 1: of the picture alone, in 0.6 of the time; None: as the card's threshold and scores were made.
 
         Raises InputError for files that are not what they should be, MissingInputError where one is not there, and
         SettingsError for another backend or other looks.
         """
-        if looks not in (1, 2):
-            raise SettingsError(f"looks {looks}: give 1 or 2")
         if backend is not None and backend not in get_args(Backend):
             raise SettingsError(f"backend {backend!r}: give one of {', '.join(get_args(Backend))}")
         given = path or SHIPPED
@@ -312,7 +314,8 @@ class Segmenter:
                     f"{tensors}: to run it without torch, make an .onnx of it (brmgeo export-onnx) where torch is "
                     "installed; or pip install 'brmgeo[train]'"
                 ) from None
-            return cls(card, "torch", tensors, _TorchNetwork(network, card.temperature, threads), looks)
+            runs = _TorchNetwork(network, card.temperature, threads)
+            return cls(card, "torch", tensors, runs, looks or card.looks)
         if not graph.is_file():
             raise MissingInputError(
                 f"{graph}: ONNX Runtime needs it; write it with brmgeo export-onnx {given}"
@@ -325,12 +328,13 @@ class Segmenter:
                 raise InputError(
                     f"{graph}: of other weights than {given.name} beside it; write it again with brmgeo export-onnx"
                 )
-        return cls(card, "onnx", graph, runner, looks)
+        return cls(card, "onnx", graph, runner, looks or card.looks)
 
     @property
     def name(self) -> str:
-        """What reports call it: the file's name and the weights' digest."""
-        return f"{self.path.stem} {self.card.digest}"
+        """What reports call it: the file's name, the weights' digest, and its looks where they are not the card's."""
+        other = "" if self.looks == self.card.looks else f", {'one look' if self.looks == 1 else 'two looks'}"
+        return f"{self.path.stem} {self.card.digest}{other}"
 
     def working_size(self, shape: tuple[int, int], gsd_m: Gsd | None) -> tuple[int, int]:
         """(rows, columns) at which the network sees a picture of ``shape``: its own where its GSD is within training.

@@ -59,7 +59,8 @@ class TrainSettings:
         weight_decay: of convolution weights; norms and biases have none.
         ema: decay of the moving average of the weights, a step.
         mean_from: the step from which on the weights that are kept are the plain mean of all epochs' moving averages
-            (Izmailov et al. 2018, Cha et al. 2021: better on ground of another kind); 0: those of the best epoch.
+            (Izmailov et al. 2018, Cha et al. 2021: better on ground of another kind), batch normalisation's statistics
+            among them; 0, or where patience ends the run before: those of the best epoch.
         overlap_weight: of the Tversky term, beside cross-entropy's 1.
         false_positives, false_negatives: weights of the two errors in the Tversky term.
         epoch_steps: steps between validations.
@@ -142,7 +143,7 @@ class Epoch:
 
 @dataclass(slots=True)
 class Run:
-    """A training run between two steps: everything that a checkpoint holds."""
+    """A training run between two steps: everything that a checkpoint holds; ``best`` is what will be kept."""
 
     step: int
     model: UNet

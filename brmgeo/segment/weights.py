@@ -41,7 +41,7 @@ class ModelCard:
         settings: its settings as plain values (``UNetSettings.plain``).
         mean, std: of each channel; the network sees (x / 255 - mean) / std.
         threshold: a pixel is building when its calibrated probability is above it, chosen on validation.
-        temperature: p = sigmoid(logit / temperature).
+        temperature: p = sigmoid(logit / temperature), or the mean of that over the looks.
         gsd_min_m, gsd_max_m: metres per pixel it was trained for.
         gsd_work_m: pictures outside of that range are resampled to this; None for the nearer end of the range.
         data, licence, metrics: what it was trained on, under which terms, and what it scores: plain values or text.
@@ -99,6 +99,13 @@ class ModelCard:
         """The first twelve digits of the checksum: what the weights go by in reports and cache keys."""
         return self.sha256[:12]
 
+    @property
+    def looks(self) -> int:
+        """Looks at a picture that the threshold and the scores are for: what ``metrics["calibration"]`` says, else 1."""
+        told = self.metrics.get("calibration") if isinstance(self.metrics, dict) else None
+        looks = told.get("looks") if isinstance(told, dict) else None
+        return looks if isinstance(looks, int) and looks in (1, 2) else 1
+
     def to_json(self) -> str:
         """The card as JSON of one line, keys in order."""
         return json.dumps(asdict(self), sort_keys=True, ensure_ascii=False, allow_nan=False)
@@ -131,7 +138,8 @@ class ModelCard:
             "|---|---|",
             f"| settings | {_inline(self.settings)} |",
             f"| input | RGB, (x / 255 - mean) / std; mean {_inline(self.mean)}, std {_inline(self.std)} |",
-            f"| probability | sigmoid(logit / {self.temperature:g}), building above {self.threshold:g} |",
+            f"| probability | sigmoid(logit / {self.temperature:g})"
+            f"{', mean of two looks' if self.looks == 2 else ''}, building above {self.threshold:g} |",
             f"| trained for | {self.gsd_min_m:g} to {self.gsd_max_m:g} m per pixel; others are resampled to {work} |",
             f"| file format | {self.format} |",
             f"| SHA-256 of tensors and card | `{self.sha256}` |",

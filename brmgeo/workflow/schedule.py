@@ -94,12 +94,13 @@ class _Dask:
             return
         client = self._start()
         from distributed import CancelledError, KilledWorker
+        from distributed.client import ClosedClientError
         from distributed.comm.core import CommClosedError
 
-        threads = max(1, sum(client.nthreads().values()))
         waiting = iter(work)
         flying: deque[Any] = deque()
         try:
+            threads = max(1, sum(client.nthreads().values()))
             while True:
                 while len(flying) < 2 * threads + 1 and (item := next(waiting, flying)) is not flying:
                     flying.append(client.submit(function, item, pure=False))
@@ -113,9 +114,10 @@ class _Dask:
                 f"{_name(function)}: {error.allowed_failures + 1} workers died one after another over the same item, "
                 f"most often for lack of memory; use smaller blocks or SCHEDULER=serial, see {self._shared / 'dask.log'}"
             ) from None
-        except (CancelledError, TimeoutError, OSError) as error:
+        except (CancelledError, ClosedClientError, TimeoutError, OSError) as error:
             # An item's own errors pass; a connection that broke a moment before the client notices is the scheduler's end.
-            if client.status == "running" and not isinstance(error, CancelledError | CommClosedError):
+            gone = (CancelledError, ClosedClientError, CommClosedError)
+            if client.status == "running" and not isinstance(error, gone):
                 raise
             raise WorkflowError(
                 f"{_name(function)}: the scheduler {self._address or 'of this machine'} went away; start it and run again"

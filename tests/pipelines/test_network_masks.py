@@ -27,6 +27,7 @@ from rasterio.enums import ColorInterp
 from brmgeo.flight.readings import Attitude
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
+from brmgeo.segment import predict
 from brmgeo.segment.predict import Segmenter
 from brmgeo.synth.flight import FlightSettings as Simulated
 from brmgeo.synth.flight import Ground, Simulator, fly
@@ -106,7 +107,7 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
 ) -> None:
     cache = tmp_path / "cache"
 
-    def ask(folder: Path, weights_file: Path, looks: int = 2) -> list[bytes]:
+    def ask(folder: Path, weights_file: Path, looks: int | None = None) -> list[bytes]:
         asked.clear()
         flight = job.read_flight(folder)
         use = job.NetworkUse(weights=weights_file, cache=cache, looks=looks)
@@ -134,8 +135,8 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
     assert len(asked) == len(first), "from another height the frames are resampled"
     ask(pictured, bright_onnx(tmp_path / "other.onnx", small_card(sha256="cd" * 32)))
     assert len(asked) == len(first)
-    assert ask(pictured, weights, looks=1) != first
-    assert len(asked) == len(first), "one look is another answer"
+    assert ask(pictured, weights, looks=2) != first
+    assert len(asked) == len(first), "two looks are another answer"
 
 
 @pytest.mark.parametrize("answer", ["mask", "probability"])
@@ -402,11 +403,10 @@ def test_a_raster_in_windows_is_as_the_whole(
 ) -> None:
     image = town(700, 1300)
     raster = write_raster(tmp_path / "in.tif", image)
-    # Once: the second look's coarser pixels lie elsewhere in a window than in the whole.
-    whole = Segmenter.load(weights, looks=1).probability(image)
+    whole = Segmenter.load(weights).probability(image)
     monkeypatch.setattr(job, "WINDOW_PX", 256)
     monkeypatch.setattr(job, "OVERLAP_PX", 64)
-    words = ("segment", raster, "--weights", weights, "--looks", "1", "--out")
+    words = ("segment", raster, "--weights", weights, "--out")
     said = say(*words, tmp_path / "p.tif", "--as", "probability")
     assert said.code == 0, said.err
     assert "1300 x 700 px of 0.5 m" in said.out
@@ -429,6 +429,16 @@ def test_a_raster_in_windows_is_as_the_whole(
         mask = src.read(1)
     assert ((mask > 0) == (got > 0.5)).mean() > 0.9999
     assert (mask[5:-5, 5:-5] == (image[5:-5, 5:-5, 0] > 100)).mean() > 0.9
+    # By two looks, in the same windows, it is what the network says of a picture.
+    monkeypatch.setattr(predict, "WINDOW_PX", 256)
+    monkeypatch.setattr(predict, "OVERLAP_PX", 64)
+    said = say(*words, tmp_path / "two.tif", "--as", "probability", "--looks", 2)
+    assert "network bright abababababab, two looks" in said.out
+    with rasterio.open(tmp_path / "two.tif") as src:
+        assert src.tags()["LOOKS"] == "2"
+        by_two = src.read(1) * 1e-4
+    assert np.abs(by_two - Segmenter.load(weights, looks=2).probability(image)).max() < 1e-4
+    assert np.abs(by_two - got).max() > 0.01
 
 
 def test_unknown_ground_stays_unknown(weights: Path, tmp_path: Path, say: Say) -> None:

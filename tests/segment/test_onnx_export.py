@@ -107,7 +107,7 @@ def test_deepness_opens_the_tile_graph(weights: Path, tmp_path: Path) -> None:
     tile = np.random.default_rng(2).integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
     x = np.transpose((np.float32(tile * 1.0 / 255.0) - mean) / std, (0, 3, 1, 2))
     got = session.run(None, {session.get_inputs()[0].name: x})[0]
-    np.testing.assert_allclose(got[0, 0], Segmenter.load(weights, looks=1).probability(tile[0]), atol=1e-5)
+    np.testing.assert_allclose(got[0, 0], Segmenter.load(weights).probability(tile[0]), atol=1e-5)
     with pytest.raises(InputError, match="made for Deepness"):
         Segmenter.load(path)
 

@@ -32,9 +32,9 @@ def segmenter(tmp_path_factory: pytest.TempPathFactory) -> Segmenter:
 
 
 @pytest.fixture(scope="module")
-def once(segmenter: Segmenter) -> Segmenter:
-    """The same network, which looks at a picture once."""
-    return dataclasses.replace(segmenter, looks=1)
+def twice(segmenter: Segmenter) -> Segmenter:
+    """The same network, which looks at a picture twice."""
+    return dataclasses.replace(segmenter, looks=2)
 
 
 def scene(rows: int, cols: int, seed: int = 0) -> np.ndarray:
@@ -57,9 +57,9 @@ def expected(image: np.ndarray, reach: int = 2) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", [(64, 96), (100, 75), (33, 17), (16, 16), (480, 640)])
-def test_any_size_is_answered_at_its_own_pixels(once: Segmenter, shape: tuple[int, int]) -> None:
+def test_any_size_is_answered_at_its_own_pixels(segmenter: Segmenter, shape: tuple[int, int]) -> None:
     image = scene(*shape)
-    got = once.probability(image)
+    got = segmenter.probability(image)
     assert got.shape == shape
     assert got.dtype == np.float32
     inside = (slice(3, -3), slice(3, -3))
@@ -68,37 +68,59 @@ def test_any_size_is_answered_at_its_own_pixels(once: Segmenter, shape: tuple[in
 
 @pytest.mark.parametrize("shape", [(64, 96), (101, 75), (20, 20), (480, 640)])
 def test_two_looks_are_the_mean_of_the_picture_and_its_coarser_mirror_image(
-    segmenter: Segmenter, once: Segmenter, shape: tuple[int, int]
+    segmenter: Segmenter, twice: Segmenter, shape: tuple[int, int]
 ) -> None:
     image = scene(*shape, 3)
     size = (round(shape[1] / 1.25), round(shape[0] / 1.25))
     mirrored = np.ascontiguousarray(image[:, ::-1])
-    far = once.probability(np.asarray(cv2.resize(mirrored, size, interpolation=cv2.INTER_AREA)))
+    far = segmenter.probability(np.asarray(cv2.resize(mirrored, size, interpolation=cv2.INTER_AREA)))
     far = np.asarray(cv2.resize(far, shape[::-1], interpolation=cv2.INTER_LINEAR))[:, ::-1]
-    got = segmenter.probability(image)
-    np.testing.assert_allclose(got, (once.probability(image) + far) / 2, atol=2e-6)
+    got = twice.probability(image)
+    np.testing.assert_allclose(got, (segmenter.probability(image) + far) / 2, atol=2e-6)
     # Mirrored back: the second look adds what lies there, not what lies opposite.
     assert np.corrcoef(got.ravel(), expected(image).ravel())[0, 1] > 0.95
 
 
-def test_a_picture_is_looked_at_once_or_twice(segmenter: Segmenter) -> None:
-    assert segmenter.looks == 2
-    assert Segmenter.load(segmenter.path, looks=1).looks == 1
-    for looks in (0, 3):
+def test_a_picture_is_looked_at_as_its_card_says_or_as_asked(segmenter: Segmenter, tmp_path: Path) -> None:
+    assert segmenter.looks == 1
+    card = small_card(metrics={"calibration": {"looks": 2}}, sha256="cd" * 32)
+    path = bright_onnx(tmp_path / "w.onnx", card)
+    assert Segmenter.load(path).looks == 2
+    assert Segmenter.load(path).name == "w cdcdcdcdcdcd"
+    assert Segmenter.load(path, looks=1).looks == 1
+    assert Segmenter.load(path, looks=1).name == "w cdcdcdcdcdcd, one look"
+    for looks in (-1, 3):
         with pytest.raises(SettingsError, match="give 1 or 2"):
-            Segmenter.load(segmenter.path, looks=looks)
+            Segmenter.load(path, looks=looks)
+    for metrics in (
+        "",
+        [],
+        {"calibration": None},
+        {"calibration": {"looks": "2"}},
+        {"calibration": {"looks": 7}},
+    ):
+        assert small_card(metrics=metrics).looks == 1
+
+
+@pytest.mark.parametrize("gsd", [None, 0.004])
+def test_pictures_of_a_few_pixels_are_looked_at_twice(twice: Segmenter, gsd: float | None) -> None:
+    picture = np.dstack([scene(16, 40), np.full((16, 40), 255, np.uint8)])
+    picture[:, 30:, 3] = 0
+    got = twice.probability(picture, gsd)
+    assert np.isfinite(got[:, :30]).all()
+    assert np.isnan(got[:, 30:]).all()
 
 
 def test_a_huge_picture_in_windows_is_as_the_whole(
-    segmenter: Segmenter, once: Segmenter, monkeypatch: pytest.MonkeyPatch
+    segmenter: Segmenter, twice: Segmenter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = scene(700, 333, 4)
-    whole, twice = once.probability(image), segmenter.probability(image)
+    whole, by_two = segmenter.probability(image), twice.probability(image)
     monkeypatch.setattr(predict, "WINDOW_PX", 128)
     monkeypatch.setattr(predict, "OVERLAP_PX", 32)
-    parts = once.probability(image)
+    parts = segmenter.probability(image)
     # A window's coarser pixels lie elsewhere than those of the whole: up to half a pixel, at edges of random noise.
-    assert np.abs(segmenter.probability(image) - twice).mean() < 0.02
+    assert np.abs(twice.probability(image) - by_two).mean() < 0.02
     # Where two windows meet, each has seen only its mirror beyond its own border, and there it weighs little.
     assert np.abs(parts - whole)[2:-2, 2:-2].max() < 0.03
     assert np.median(np.abs(parts - whole)) < 1e-6
@@ -223,7 +245,7 @@ def test_torch_runs_the_same_card(tmp_path: Path) -> None:
 
     path = tmp_path / "w.safetensors"
     save_weights(path, small_tensors(), small_card())
-    net = Segmenter.load(path, looks=1)
+    net = Segmenter.load(path)
     assert net.backend == "torch"
     image = scene(64, 96)
     network, card = load_network(path)

@@ -272,7 +272,9 @@ def test_external_scheduler(dask_elsewhere: tuple[str, subprocess.Popen[str]], t
         process.kill()
         with pytest.raises(WorkflowError, match="went away; start it and run again") as error:
             list(results)
-    assert "\n" not in str(error.value)
+        assert "\n" not in str(error.value)
+        with pytest.raises(WorkflowError, match="went away"):  # what comes after it fares no better
+            list(map(toys.square, range(3)))
 
 
 def test_workers_with_another_brmgeo_or_disk_are_refused(
