@@ -780,13 +780,24 @@ def score(segmenter: Any, pictures: Sequence[Picture]) -> dict[str, Scores]:
 
 
 def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
-    """One line for the model card: the weights' own licence and what their sources ask for."""
+    """One line for the model card: the weights' own licence and what their sources and those of earlier parts ask for."""
     asked = [
         f"{c['name']}: " + (f"{c['attribution']} ({c['licence']})" if c.get("attribution") else c["licence"])
-        for c in credits
+        for c in _with_earlier(credits)
         if c.get("licence")
     ]
-    return "Apache-2.0 for the weights" + ("; trained on " + "; ".join(asked) if asked else "")
+    return "Apache-2.0 for the weights" + ("; trained on " + "; ".join(dict.fromkeys(asked)) if asked else "")
+
+
+def _with_earlier(credits: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """The credits, and in place of weights that training went on from theirs."""
+    for credit in credits:
+        data = credit.get("data")
+        sources = data.get("sources") if isinstance(data, Mapping) else None
+        if credit.get("kind") == "start" and isinstance(sources, list):
+            yield from _with_earlier([s for s in sources if isinstance(s, Mapping) and "name" in s])
+        else:
+            yield credit
 
 
 # --- files for people --------------------------------------------------------------------------------------------

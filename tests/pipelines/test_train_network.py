@@ -190,6 +190,12 @@ def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:
         "Apache-2.0 for the weights; trained on far: Those who flew (CC BY 4.0); "
         "weights 0123, which it went on from: ODbL 1.0"
     )
+    earlier = {"sources": [*credits[:2], {"name": "near", "licence": "CC0"}]}
+    third = {"name": "weights 4567", "kind": "start", "licence": "all of it again", "data": earlier}
+    assert network.licence_of([credits[0], third]) == (
+        "Apache-2.0 for the weights; trained on far: Those who flew (CC BY 4.0); "
+        "weights 0123, which it went on from: ODbL 1.0; near: CC0"
+    )
 
 
 def test_a_generated_scene_is_painted_once_and_labels_its_roofs(tmp_path: Path) -> None:
