@@ -32,7 +32,7 @@ maps: setup  ## Build all maps of REGION (default demo): footprints, imagery, bu
 tiles: setup  ## Cut training tiles of REGION (or of REGIONS="a b c"); ARGS=--align moves labels onto the imagery
 	@$(BRMGEO) tiles $(if $(REGIONS),$(REGIONS),$(REGION)) $(ARGS)
 
-train: setup  ## Train a U-Net on generated regions (minutes, CPU) and test it on REGION; RECIPE=shipped: the shipped weights
+train: setup  ## Train a U-Net on generated regions (minutes, CPU) and test it on REGION; RECIPE=shipped: how the shipped ones began
 	@$(BRMGEO) train $(REGION) $(if $(RECIPE),--recipe $(RECIPE)) $(ARGS)
 
 status: setup  ## Show which stages of REGION are fresh, and why the others are not
