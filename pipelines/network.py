@@ -663,8 +663,7 @@ def train(
 
     run = trainer.train(on_epoch, on_step)
     best = run.best_epoch
-    averaged = [e.epoch for e in run.history if settings.mean_from and e.step >= settings.mean_from]
-    kept = averaged or [best.epoch if best else 0]
+    kept = [e.epoch for e in engine.epochs_in_mean(run.history, settings)] or [best.epoch if best else 0]
     told = f"the mean of epochs {kept[0]} to {kept[-1]}" if len(kept) > 1 else f"epoch {kept[0]}"
     say(f"trained: {run.step} steps, kept: {told}")
     facts = finish(run.best, unet, recipe, augment, ground, out, say, run.step)
@@ -699,20 +698,21 @@ def finish(
     weights = out / "model.safetensors"
     tensors = tensors_of(state)
     save_weights(weights, tensors, card)
-    before = _histograms(Segmenter.load(weights, "torch", looks=LOOKS), ground.validation)
-    card = replace(card, temperature=round(_weighed(before).temperature(), 4))
+    before = _weighed(_histograms(Segmenter.load(weights, "torch", looks=LOOKS), ground.validation))
+    card = replace(card, temperature=round(before.temperature(), 4))
     save_weights(weights, tensors, card)
     # The temperature that fits the mean of two looks goes into each of them, which is nearly the same: so the threshold is
     # chosen, and the calibration's error taken, on what comes out.
     segmenter = Segmenter.load(weights, "torch", looks=LOOKS)
-    after = _histograms(segmenter, ground.validation)
-    card = replace(card, threshold=round(best_threshold(after), 3))
+    grounds = _histograms(segmenter, ground.validation)
+    after = _weighed(grounds)
+    card = replace(card, threshold=round(best_threshold(grounds), 3))
     calibration = {
         "looks": segmenter.looks,
         "temperature": card.temperature,
         "threshold": card.threshold,
-        "calibration_error_before": round(_weighed(before).calibration_error(), 4),
-        "calibration_error": round(_weighed(after).calibration_error(), 4),
+        "calibration_error_before": round(before.calibration_error(), 4),
+        "calibration_error": round(after.calibration_error(), 4),
     }
     say(f"calibrated on validation: temperature {card.temperature}, threshold {card.threshold}")
     segmenter = replace(segmenter, card=card)
@@ -732,7 +732,7 @@ def finish(
     export_onnx(weights, out / "model.onnx")
     _draw_reliability(
         out / "reliability.png",
-        {"as trained": _weighed(before), f"temperature {card.temperature:.2f}": _weighed(after)},
+        {"as trained": before, f"temperature {card.temperature:.2f}": after},
     )
     return {"calibration": calibration, "scores": scores}
 

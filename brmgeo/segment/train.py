@@ -423,11 +423,8 @@ class Trainer:
         )
         run.history.append(epoch)
         run.losses.clear()
-        first = self._settings.mean_from
-        if first and run.step >= first:
-            run.best = mean_with(
-                run.best, run.average.state_dict(), sum(e.step >= first for e in run.history)
-            )
+        if averaged := epochs_in_mean(run.history, self._settings):
+            run.best = mean_with(run.best, run.average.state_dict(), len(averaged))
         elif before is None or loss < before.validation_loss:
             run.best = _copy(run.average.state_dict())
         return np.asarray(1 / (1 + np.exp(-logits)), np.float32)
@@ -504,6 +501,11 @@ class Trainer:
             raise InputError(
                 f"{path}: is not a whole checkpoint ({' '.join(str(error).split())[:100]}); delete it to begin again"
             ) from None
+
+
+def epochs_in_mean(history: Sequence[Epoch], settings: TrainSettings) -> list[Epoch]:
+    """The epochs whose averages' mean is kept; none where the best epoch is, which without ``mean_from`` is always."""
+    return [e for e in history if settings.mean_from and e.step >= settings.mean_from]
 
 
 def mean_with(mean: Mapping[str, Tensor], state: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
