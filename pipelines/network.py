@@ -686,6 +686,7 @@ def finish(
     from brmgeo.segment.onnx_export import export_onnx
     from brmgeo.segment.predict import LOOKS, Segmenter
     from brmgeo.segment.train import tensors_of
+    from brmgeo.segment.unet import shifted
     from brmgeo.segment.weights import ModelCard, save_weights
 
     low, high = augment.gsd_m
@@ -696,13 +697,15 @@ def finish(
         licence=licence_of(ground.credits),
     )  # fmt: skip
     weights = out / "model.safetensors"
-    tensors = tensors_of(state)
-    save_weights(weights, tensors, card)
+    save_weights(weights, tensors_of(state), card)
     before = _weighed(_histograms(Segmenter.load(weights, "torch", looks=LOOKS), ground.validation))
-    card = replace(card, temperature=round(before.temperature(), 4))
+    temperature, shift = before.calibration()
+    card = replace(card, temperature=round(temperature, 4))
+    # The shift goes into the weights: whoever reads them, or the ONNX, has calibrated answers without knowing of it.
+    tensors = tensors_of(shifted(state, shift))
     save_weights(weights, tensors, card)
-    # The temperature that fits the mean of two looks goes into each of them, which is nearly the same: so the threshold is
-    # chosen, and the calibration's error taken, on what comes out.
+    # What fits the mean of two looks goes into each of them, which is nearly the same: so the threshold is chosen, and the
+    # calibration's error taken, on what comes out.
     segmenter = Segmenter.load(weights, "torch", looks=LOOKS)
     grounds = _histograms(segmenter, ground.validation)
     after = _weighed(grounds)
@@ -710,11 +713,14 @@ def finish(
     calibration = {
         "looks": segmenter.looks,
         "temperature": card.temperature,
+        "shift": round(shift, 4),
         "threshold": card.threshold,
         "calibration_error_before": round(before.calibration_error(), 4),
         "calibration_error": round(after.calibration_error(), 4),
     }
-    say(f"calibrated on validation: temperature {card.temperature}, threshold {card.threshold}")
+    say(
+        f"calibrated on validation: temperature {card.temperature}, shift {calibration['shift']}, threshold {card.threshold}"
+    )
     segmenter = replace(segmenter, card=card)
     scores = {
         # What cannot be told of a source (features of frames without room for a disc) is left out.
@@ -732,7 +738,7 @@ def finish(
     export_onnx(weights, out / "model.onnx")
     _draw_reliability(
         out / "reliability.png",
-        {"as trained": before, f"temperature {card.temperature:.2f}": after},
+        {"as trained": before, "calibrated": after},
     )
     return {"calibration": calibration, "scores": scores}
 

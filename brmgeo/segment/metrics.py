@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
 
@@ -175,7 +175,7 @@ def ring_features(mask: NDArray[np.bool_], known: NDArray[np.bool_], n: int = 3)
 class LogitHistogram:
     """How often each logit was given to buildings and to other ground; all that calibration and threshold need.
 
-    ``add`` frames of validation, then ``temperature`` and ``reliability``, and ``best_threshold`` of several. Logits
+    ``add`` frames of validation, then ``calibration`` and ``reliability``, and ``best_threshold`` of several. Logits
     beyond +-``LIMIT`` count as that; bins are 0.05 wide, so what follows is exact to 0.6 % of probability.
     """
 
@@ -199,20 +199,27 @@ class LogitHistogram:
         """(BINS,) float64, the middle of each bin."""
         return np.asarray((np.arange(self.BINS) + 0.5) * 0.05 - self.LIMIT, np.float64)
 
-    def entropy(self, temperature: float) -> float:
-        """Mean cross-entropy, nats a pixel, of sigmoid(logit / temperature)."""
-        x = self.logits / temperature
+    def entropy(self, temperature: float, shift: float = 0.0) -> float:
+        """Mean cross-entropy, nats a pixel, of sigmoid((logit + shift) / temperature)."""
+        x = (self.logits + shift) / temperature
         cost = self.building * np.logaddexp(0, -x) + self.other * np.logaddexp(0, x)
         return float(cost.sum() / max(int((self.building + self.other).sum()), 1))
 
-    def temperature(self) -> float:
-        """The temperature of the lowest cross-entropy (Guo et al. 2017), between 0.2 and 5; 1 without both classes."""
+    def calibration(self) -> tuple[float, float]:
+        """(temperature, shift) whose sigmoid((logit + shift) / temperature) has the lowest cross-entropy (Platt 1999).
+
+        A temperature alone (Guo et al. 2017) leaves 0.5 where it is, and a loss that favours the rare class, such as soft
+        Dice, moves just that. The temperature is between 0.2 and 5, the shift between -5 and 5; (1, 0) without both classes.
+        """
         if not self.building.any() or not self.other.any():
-            return 1.0
-        found = minimize_scalar(
-            lambda t: self.entropy(math.exp(t)), bounds=(math.log(0.2), math.log(5.0)), method="bounded"
-        )
-        return float(math.exp(found.x))
+            return 1.0, 0.0
+
+        def cost(v: NDArray[np.float64]) -> float:
+            return self.entropy(math.exp(v[0]), float(v[1]))
+
+        limits = [(math.log(0.2), math.log(5.0)), (-5.0, 5.0)]
+        found = minimize(cost, np.zeros(2), method="L-BFGS-B", bounds=limits)
+        return float(math.exp(found.x[0])), float(found.x[1])
 
     def ious(self) -> NDArray[np.float64]:
         """(BINS,) float64: the IoU of building where the bins after each one are called that."""
@@ -222,10 +229,10 @@ class LogitHistogram:
         return np.asarray(np.append(hit[1:], 0) / np.maximum(union, 1), np.float64)
 
     def reliability(
-        self, temperature: float = 1.0
+        self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """(mean probability, share of building, pixels) of RELIABILITY_BINS equal bins of probability; NaN in empty ones."""
-        p = 1 / (1 + np.exp(-self.logits / temperature))
+        p = 1 / (1 + np.exp(-self.logits))
         both = self.building + self.other
         index = np.minimum((p * RELIABILITY_BINS).astype(int), RELIABILITY_BINS - 1)
         count = np.bincount(index, both, RELIABILITY_BINS)
@@ -234,15 +241,15 @@ class LogitHistogram:
             was = np.bincount(index, self.building, RELIABILITY_BINS) / count
         return said, was, count.astype(np.int64)
 
-    def calibration_error(self, temperature: float = 1.0) -> float:
+    def calibration_error(self) -> float:
         """Expected calibration error: mean over pixels of |share of building - probability| of their bin."""
-        said, was, count = self.reliability(temperature)
+        said, was, count = self.reliability()
         filled = count > 0
         return float((np.abs(said - was)[filled] * count[filled]).sum() / max(int(count.sum()), 1))
 
 
-def best_threshold(grounds: Sequence[LogitHistogram], temperature: float = 1.0) -> float:
-    """The calibrated probability above which building has the highest mean of the grounds' IoUs.
+def best_threshold(grounds: Sequence[LogitHistogram]) -> float:
+    """The probability above which building has the highest mean of the grounds' IoUs.
 
     A mean of IoUs, not the IoU of all pixels: else the ground with the most building would choose alone. Grounds without
     both classes have no say; 0.5 where none has.
@@ -252,4 +259,4 @@ def best_threshold(grounds: Sequence[LogitHistogram], temperature: float = 1.0) 
         return 0.5
     mean = np.mean([g.ious() for g in told], axis=0)
     edge = told[0].logits[int(np.argmax(mean))] + 0.025
-    return float(np.clip(1 / (1 + np.exp(-edge / temperature)), 0.01, 0.99))
+    return float(np.clip(1 / (1 + np.exp(-edge)), 0.01, 0.99))

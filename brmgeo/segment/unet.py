@@ -12,6 +12,7 @@ In place of the encoder's lower levels it can have one that was trained on photo
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
@@ -134,3 +135,8 @@ class UNet(nn.Module):
     def parameter_count(self) -> int:
         """Number of trained numbers."""
         return sum(p.numel() for p in self.parameters())
+
+
+def shifted(state: Mapping[str, Tensor], shift: float) -> dict[str, Tensor]:
+    """Weights of a U-Net every logit of which is ``shift`` higher than with ``state``."""
+    return {**state, "head.bias": state["head.bias"] + shift}

@@ -122,11 +122,11 @@ def test_shapes_must_agree() -> None:
 
 @pytest.fixture(scope="module")
 def overconfident() -> tuple[LogitHistogram, np.ndarray, np.ndarray]:
-    """Logits that are right after division by 2.5."""
+    """Logits that are right after 0.8 is taken off and they are divided by 2.5."""
     rng = np.random.default_rng(3)
     right = rng.normal(-1.0, 1.5, 200_000)
     truth = rng.random(right.size) < 1 / (1 + np.exp(-right))
-    logits = (2.5 * right).astype(np.float32)
+    logits = (2.5 * right + 0.8).astype(np.float32)
     histogram = LogitHistogram()
     label = np.where(truth, 255, 0).astype(np.uint8)
     histogram.add(logits[:90_000], label[:90_000])
@@ -134,38 +134,43 @@ def overconfident() -> tuple[LogitHistogram, np.ndarray, np.ndarray]:
     return histogram, logits, truth
 
 
-def test_temperature_undoes_overconfidence(
+def test_calibration_undoes_overconfidence_and_a_shift(
     overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray],
 ) -> None:
     histogram, logits, truth = overconfident
-    temperature = histogram.temperature()
+    temperature, shift = histogram.calibration()
     assert temperature == pytest.approx(2.5, abs=0.05)
-    assert histogram.calibration_error(1.0) > 0.05
-    assert histogram.calibration_error(temperature) < 0.01
-    x = logits / 2.0
+    assert shift == pytest.approx(-0.8, abs=0.05)
+    assert histogram.calibration_error() > 0.05
+    calibrated = LogitHistogram()
+    calibrated.add(
+        ((logits + shift) / temperature).astype(np.float32), np.where(truth, 255, 0).astype(np.uint8)
+    )
+    assert calibrated.calibration_error() < 0.01
+    x = (logits + 0.3) / 2.0
     exact = np.mean(np.where(truth, np.logaddexp(0, -x), np.logaddexp(0, x)))
-    assert histogram.entropy(2.0) == pytest.approx(exact, abs=1e-3)
+    assert histogram.entropy(2.0, 0.3) == pytest.approx(exact, abs=1e-3)
 
 
 def test_threshold_is_that_of_the_best_iou(
     overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray],
 ) -> None:
     histogram, logits, truth = overconfident
-    p = 1 / (1 + np.exp(-logits / 2.5))
+    p = 1 / (1 + np.exp(-logits.astype(np.float64)))
 
     def iou(threshold: float) -> float:
         return float(np.count_nonzero((p > threshold) & truth) / np.count_nonzero((p > threshold) | truth))
 
     best = max(iou(t) for t in np.linspace(0.02, 0.98, 97))
-    assert iou(best_threshold([histogram], 2.5)) == pytest.approx(best, abs=2e-3)
+    assert iou(best_threshold([histogram])) == pytest.approx(best, abs=2e-3)
 
 
 def test_unknown_and_missing_pixels_count_nowhere() -> None:
     histogram = LogitHistogram()
     histogram.add(np.array([[1.0, np.nan, -99.0]], np.float32), np.array([[127, 255, 0]], np.uint8))
     assert (histogram.building.sum(), histogram.other.sum()) == (0, 1)
-    assert histogram.temperature() == 1.0
-    assert best_threshold([histogram], 1.0) == 0.5
+    assert histogram.calibration() == (1.0, 0.0)
+    assert best_threshold([histogram]) == 0.5
 
 
 def test_every_ground_has_the_same_say_about_the_threshold() -> None:
@@ -179,12 +184,12 @@ def test_every_ground_has_the_same_say_about_the_threshold() -> None:
         return own
 
     dense, sparse, empty = ground(0.5, 1.0), ground(0.05, -0.5), LogitHistogram()
-    found = best_threshold([dense, sparse, empty], 1.0)
+    found = best_threshold([dense, sparse, empty])
     at = int(np.argmin(np.abs(1 / (1 + np.exp(-(dense.logits + 0.025))) - found)))
     mean = (dense.ious() + sparse.ious()) / 2
     assert mean[at] == pytest.approx(mean.max(), abs=1e-9)
     # All pixels in one pot ask the ground with the most building only.
     pot = LogitHistogram(dense.building + sparse.building, dense.other + sparse.other)
-    assert best_threshold([pot], 1.0) != pytest.approx(found, abs=0.02)
+    assert best_threshold([pot]) != pytest.approx(found, abs=0.02)
     assert sparse.ious()[at] > sparse.ious()[int(np.argmax(pot.ious()))]
-    assert best_threshold([empty], 1.0) == 0.5
+    assert best_threshold([empty]) == 0.5

@@ -8,7 +8,7 @@ import torch
 
 from brmgeo.errors import SettingsError
 from brmgeo.segment.train import predict
-from brmgeo.segment.unet import UNet, UNetSettings
+from brmgeo.segment.unet import UNet, UNetSettings, shifted
 
 
 def counted(widths: tuple[int, ...], channels: int = 3) -> int:
@@ -36,6 +36,19 @@ def test_the_answer_has_the_size_of_the_picture(norm: str) -> None:
     net = UNet(UNetSettings(widths=(8, 16, 24), norm=norm)).eval()  # type: ignore[arg-type]
     with torch.inference_mode():
         assert net(torch.zeros(2, 3, 20, 36)).shape == (2, 1, 20, 36)
+
+
+@pytest.mark.parametrize("encoder", ["plain", "efficientnet-lite0"])
+def test_a_shift_is_the_same_everywhere(encoder: str) -> None:
+    torch.manual_seed(1)
+    net = UNet(UNetSettings(widths=(8, 16, 24, 32, 40), encoder=encoder)).eval()  # type: ignore[arg-type]
+    x = torch.randn(1, 3, 64, 64)
+    with torch.inference_mode():
+        before = net(x)
+        state = shifted(net.state_dict(), -0.7)
+        assert torch.equal(net(x), before)
+        net.load_state_dict(state)
+        assert torch.allclose(net(x), before - 0.7, atol=1e-5)
 
 
 def test_a_pixel_sees_far_and_is_moved_with_the_picture() -> None:
