@@ -278,17 +278,31 @@ def _inline(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _prose(value: Any) -> list[str]:
+def _prose(value: Any, indent: str = "") -> list[str]:
+    """A list of Markdown: a line for each named value, one for each of several things, and below it what is nested in it."""
     if isinstance(value, Mapping):
         lines = []
         for key, inner in value.items():
-            several = isinstance(inner, list | tuple) and inner and all(isinstance(v, Mapping) for v in inner)
-            lines += (
-                [f"- {key}:", *(f"  - {_inline(v)}" for v in inner)]
-                if several
-                else [f"- {key}: {_inline(inner)}"]
-            )
+            if _things(inner):
+                lines.append(f"{indent}- {key}:")
+                for thing in inner:
+                    nested = {
+                        k: v
+                        for k, v in thing.items()
+                        if isinstance(v, Mapping) and any(map(_things, v.values()))
+                    }
+                    told = {k: thing[k] for k in sorted(thing, key=lambda k: k != "name") if k not in nested}
+                    lines.append(f"{indent}  - {_inline(told)}")
+                    for name, below in nested.items():
+                        lines += [f"{indent}    - {name}:", *_prose(below, f"{indent}      ")]
+            else:
+                lines.append(f"{indent}- {key}: {_inline(inner)}")
         return lines
     if isinstance(value, list | tuple):
-        return [f"- {_inline(inner)}" for inner in value]
+        return [f"{indent}- {_inline(inner)}" for inner in value]
     return [str(value)]
+
+
+def _things(value: Any) -> bool:
+    """Whether this is a list of several named values each."""
+    return isinstance(value, list | tuple) and bool(value) and all(isinstance(v, Mapping) for v in value)

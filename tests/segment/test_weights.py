@@ -58,6 +58,21 @@ def test_the_readable_card_gives_every_source_a_line_of_its_own() -> None:
     assert "- steps: 7" in lines
 
 
+def test_the_readable_card_shows_earlier_parts_below_the_later_one() -> None:
+    earlier = {"steps": 7, "sources": [{"name": "towns", "seeds": [1, 2]}]}
+    sources = [{"name": "weights 0123", "data": earlier, "licence": "CC BY 4.0"}, {"name": "Kampala"}]
+    lines = small_card(data={"sources": sources}).to_markdown("w").splitlines()
+    at = lines.index("- sources:")
+    assert lines[at + 1 : at + 7] == [
+        "  - name weights 0123, licence CC BY 4.0",
+        "    - data:",
+        "      - steps: 7",
+        "      - sources:",
+        "        - name towns, seeds 1, 2",
+        "  - name Kampala",
+    ]
+
+
 def test_same_weights_same_bytes(weights: Path, tmp_path: Path) -> None:
     tensors, card = load_weights(weights)
     again = tmp_path / "again.safetensors"
