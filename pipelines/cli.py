@@ -41,7 +41,8 @@ weights_option = click.option(
 looks_option = click.option(
     "--looks",
     type=click.IntRange(1, 2),
-    help="Looks of the network at a picture, 1 or 2 (default: as its weights say; the shipped ones 2).",
+    help="Looks of the network at a picture, 1 or 2 (default: as its weights say; the shipped ones 2); nothing where a "
+    "flight's own masks are taken.",
 )
 
 

@@ -785,6 +785,9 @@ def score(segmenter: Any, pictures: Sequence[Picture]) -> dict[str, Scores]:
     return total
 
 
+_OWN_LICENCE = "Apache-2.0 for the weights"
+
+
 def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
     """One line for the model card: the weights' own licence and what their sources and those of earlier parts ask for."""
     asked = [
@@ -792,18 +795,23 @@ def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
         for c in _with_earlier(credits)
         if c.get("licence")
     ]
-    return "Apache-2.0 for the weights" + ("; trained on " + "; ".join(dict.fromkeys(asked)) if asked else "")
+    return _OWN_LICENCE + ("; trained on " + "; ".join(dict.fromkeys(asked)) if asked else "")
 
 
 def _with_earlier(credits: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-    """The credits, and in place of weights that training went on from theirs."""
+    """The credits, and after weights that training went on from theirs; in place of them where the terms are the same."""
     for credit in credits:
         data = credit.get("data")
         sources = data.get("sources") if isinstance(data, Mapping) else None
+        earlier: list[Mapping[str, Any]] = []
         if credit.get("kind") == "start" and isinstance(sources, list):
-            yield from _with_earlier([s for s in sources if isinstance(s, Mapping) and "name" in s])
-        else:
+            earlier = list(_with_earlier([s for s in sources if isinstance(s, Mapping) and "name" in s]))
+        told = str(credit.get("licence", "")).startswith(_OWN_LICENCE) and any(
+            c.get("licence") for c in earlier
+        )
+        if not told:
             yield credit
+        yield from earlier
 
 
 # --- files for people --------------------------------------------------------------------------------------------

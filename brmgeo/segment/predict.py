@@ -315,7 +315,7 @@ class Segmenter:
                     "installed; or pip install 'brmgeo[train]'"
                 ) from None
             runs = _TorchNetwork(network, card.temperature, threads)
-            return cls(card, "torch", tensors, runs, looks or card.looks)
+            return cls(card, "torch", tensors, runs, card.looks if looks is None else looks)
         if not graph.is_file():
             raise MissingInputError(
                 f"{graph}: ONNX Runtime needs it; write it with brmgeo export-onnx {given}"
@@ -328,7 +328,7 @@ class Segmenter:
                 raise InputError(
                     f"{graph}: of other weights than {given.name} beside it; write it again with brmgeo export-onnx"
                 )
-        return cls(card, "onnx", graph, runner, looks or card.looks)
+        return cls(card, "onnx", graph, runner, card.looks if looks is None else looks)
 
     @property
     def name(self) -> str:

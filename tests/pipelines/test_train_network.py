@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.flight.camera import pixel_from_point, world_from_camera
@@ -191,11 +192,27 @@ def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:
         "weights 0123, which it went on from: ODbL 1.0"
     )
     earlier = {"sources": [*credits[:2], {"name": "near", "licence": "CC0"}]}
-    third = {"name": "weights 4567", "kind": "start", "licence": "all of it again", "data": earlier}
+    third = {
+        "name": "weights 4567",
+        "kind": "start",
+        "licence": "Apache-2.0 for the weights; and all of it again",
+        "data": earlier,
+    }
     assert network.licence_of([credits[0], third]) == (
         "Apache-2.0 for the weights; trained on far: Those who flew (CC BY 4.0); "
         "weights 0123, which it went on from: ODbL 1.0; near: CC0"
     )
+    # Terms of foreign weights are never lost behind those of what they were trained on.
+    foreign = {"name": "weights 89ab", "kind": "start", "licence": "CC BY-NC 4.0"}
+    for sources, more in (
+        ([], ""),
+        (["towns of X"], ""),
+        ([{"name": "own"}], ""),
+        ([{"name": "near", "licence": "CC0"}], "; near: CC0"),
+    ):
+        assert network.licence_of([{**foreign, "data": {"sources": sources}}]) == (
+            f"Apache-2.0 for the weights; trained on weights 89ab: CC BY-NC 4.0{more}"
+        )
 
 
 def test_a_generated_scene_is_painted_once_and_labels_its_roofs(tmp_path: Path) -> None:
@@ -336,10 +353,12 @@ def test_tiles_are_cut_for_what_they_are_wanted_for(monkeypatch: pytest.MonkeyPa
 @pytest.mark.slow
 def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path) -> None:
     recipe = tmp_path / "tiny.toml"
-    recipe.write_text(TINY)
+    averaged = TINY.replace("steps = 4", "steps = 4\nmean_from = 3")
+    recipe.write_text(averaged)
     out = tmp_path / "out"
     said: list[str] = []
     facts = network.train(recipe, tmp_path, out, say=said.append)
+    assert facts["training"]["epochs_kept"] == [2, 2]
     assert any("flown: not tested on" in line for line in said)
     made = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert made == {
@@ -357,6 +376,13 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
         hit += int(((mask == 255) & (label == 255)).sum())
         union += int(((mask == 255) | (label == 255)).sum())
     assert facts["scores"]["test: far"]["iou"] == pytest.approx(hit / union, abs=2e-4)
+    assert segmenter.looks == segmenter.card.looks == 2
+    shift = facts["calibration"]["shift"]
+    assert abs(shift) > 0.01  # a network of four steps is far from calibrated
+    trained, kept = load_file(out / "checkpoint.safetensors"), load_file(out / "model.safetensors")
+    for name, tensor in kept.items():
+        more = shift if name == "head.bias" else 0.0
+        np.testing.assert_allclose(tensor, trained[f"best/{name}"] + more, atol=6e-5)
     assert {"seeds": [901]}.items() <= segmenter.card.data["sources"][0].items()
     assert len((out / "curves.csv").read_text().splitlines()) == 3
     weights = (out / "model.safetensors").read_bytes()
@@ -364,9 +390,12 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
     network.train(recipe, tmp_path, out, say=said.append)
     assert not any(line.startswith("epoch") for line in said)
     assert (out / "model.safetensors").read_bytes() == weights
-    recipe.write_text(TINY.replace("seeds = [901]", "seeds = [901]\nweight = 2.0"))
+    recipe.write_text(averaged.replace("seeds = [901]", "seeds = [901]\nweight = 2.0"))
     with pytest.raises(InputError, match="other settings or data"):
         network.train(recipe, tmp_path, out, say=said.append)
+    short = network.train(recipe, tmp_path, tmp_path / "short", steps=2, say=said.append)
+    assert short["training"]["steps"] == 2
+    assert short["training"]["epochs_kept"] == [1, 1]
 
 
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_a_picture_is_looked_at_as_its_card_says_or_as_asked(segmenter: Segmente
     assert Segmenter.load(path).name == "w cdcdcdcdcdcd"
     assert Segmenter.load(path, looks=1).looks == 1
     assert Segmenter.load(path, looks=1).name == "w cdcdcdcdcdcd, one look"
-    for looks in (-1, 3):
+    for looks in (-1, 0, 3):
         with pytest.raises(SettingsError, match="give 1 or 2"):
             Segmenter.load(path, looks=looks)
     for metrics in (
@@ -120,7 +120,7 @@ def test_a_huge_picture_in_windows_is_as_the_whole(
     monkeypatch.setattr(predict, "OVERLAP_PX", 32)
     parts = segmenter.probability(image)
     # A window's coarser pixels lie elsewhere than those of the whole: up to half a pixel, at edges of random noise.
-    assert np.abs(twice.probability(image) - by_two).mean() < 0.02
+    assert np.abs(twice.probability(image) - by_two).mean() < 0.003
     # Where two windows meet, each has seen only its mirror beyond its own border, and there it weighs little.
     assert np.abs(parts - whole)[2:-2, 2:-2].max() < 0.03
     assert np.median(np.abs(parts - whole)) < 1e-6
