@@ -248,15 +248,15 @@ class LogitHistogram:
         return float((np.abs(said - was)[filled] * count[filled]).sum() / max(int(count.sum()), 1))
 
 
-def best_threshold(grounds: Sequence[LogitHistogram]) -> float:
-    """The probability above which building has the highest mean of the grounds' IoUs.
+def best_threshold(grounds: Sequence[LogitHistogram]) -> tuple[float, float]:
+    """The probability above which building has the highest mean of the grounds' IoUs, and that mean.
 
     A mean of IoUs, not the IoU of all pixels: else the ground with the most building would choose alone. Grounds without
-    both classes have no say; 0.5 where none has.
+    both classes have no say; (0.5, 0.0) where none has.
     """
     told = [g for g in grounds if g.building.any() and g.other.any()]
     if not told:
-        return 0.5
+        return 0.5, 0.0
     mean = np.mean([g.ious() for g in told], axis=0)
     edge = told[0].logits[int(np.argmax(mean))] + 0.025
-    return float(np.clip(1 / (1 + np.exp(-edge)), 0.01, 0.99))
+    return float(np.clip(1 / (1 + np.exp(-edge)), 0.01, 0.99)), float(mean.max())

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
+import types
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
@@ -18,8 +20,11 @@ from brmgeo.flight.camera import pixel_from_point, world_from_camera
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.flight.view import raised
 from brmgeo.region import load_region
+from brmgeo.segment.augment import AugmentSettings
+from brmgeo.segment.metrics import LogitHistogram
 from brmgeo.segment.predict import Segmenter
 from brmgeo.segment.shards import TileInfo
+from brmgeo.segment.unet import UNet, UNetSettings
 from pipelines import network, training
 from pipelines.cli import cli
 
@@ -376,7 +381,7 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
         hit += int(((mask == 255) & (label == 255)).sum())
         union += int(((mask == 255) | (label == 255)).sum())
     assert facts["scores"]["test: far"]["iou"] == pytest.approx(hit / union, abs=2e-4)
-    assert segmenter.looks == segmenter.card.looks == 2
+    assert segmenter.looks == facts["calibration"]["looks"]
     shift = facts["calibration"]["shift"]
     assert abs(shift) > 0.01  # a network of four steps is far from calibrated
     trained, kept = load_file(out / "checkpoint.safetensors"), load_file(out / "model.safetensors")
@@ -396,6 +401,33 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
     short = network.train(recipe, tmp_path, tmp_path / "short", steps=2, say=said.append)
     assert short["training"]["steps"] == 2
     assert short["training"]["epochs_kept"] == [1, 1]
+
+
+@pytest.mark.parametrize("better", [1, 2])
+def test_weights_are_for_the_looks_that_validation_asks_for(
+    better: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(5)
+    label = np.where(rng.random((100, 100)) < 0.3, 255, 0).astype(np.uint8)
+
+    def histograms(segmenter: Segmenter, _: object) -> list[LogitHistogram]:
+        own = LogitHistogram()
+        noise = rng.normal(0.0, 2.0 if segmenter.looks == better else 4.0, label.shape)
+        own.add((np.where(label == 255, 2.0, -2.0) + noise).astype(np.float32), label)
+        return [own]
+
+    monkeypatch.setattr(network, "_histograms", histograms)
+    recipe_path = tmp_path / "tiny.toml"
+    recipe_path.write_text(TINY)
+    unet = UNetSettings(widths=(8, 16))
+    torch.manual_seed(0)
+    ground: Any = types.SimpleNamespace(validation={}, test={}, credits=[])
+    facts = network.finish(
+        UNet(unet).state_dict(), unet, network.read_recipe(recipe_path), AugmentSettings(), ground,
+        tmp_path, lambda _: None, 4,
+    )  # fmt: skip
+    assert facts["calibration"]["looks"] == better
+    assert Segmenter.load(tmp_path / "model.safetensors").looks == better
 
 
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

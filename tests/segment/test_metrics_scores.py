@@ -162,7 +162,9 @@ def test_threshold_is_that_of_the_best_iou(
         return float(np.count_nonzero((p > threshold) & truth) / np.count_nonzero((p > threshold) | truth))
 
     best = max(iou(t) for t in np.linspace(0.02, 0.98, 97))
-    assert iou(best_threshold([histogram])) == pytest.approx(best, abs=2e-3)
+    threshold, reached = best_threshold([histogram])
+    assert iou(threshold) == pytest.approx(best, abs=2e-3)
+    assert reached == pytest.approx(iou(threshold), abs=1e-6)
 
 
 def test_unknown_and_missing_pixels_count_nowhere() -> None:
@@ -170,7 +172,7 @@ def test_unknown_and_missing_pixels_count_nowhere() -> None:
     histogram.add(np.array([[1.0, np.nan, -99.0]], np.float32), np.array([[127, 255, 0]], np.uint8))
     assert (histogram.building.sum(), histogram.other.sum()) == (0, 1)
     assert histogram.calibration() == (1.0, 0.0)
-    assert best_threshold([histogram]) == 0.5
+    assert best_threshold([histogram]) == (0.5, 0.0)
 
 
 def test_every_ground_has_the_same_say_about_the_threshold() -> None:
@@ -184,12 +186,12 @@ def test_every_ground_has_the_same_say_about_the_threshold() -> None:
         return own
 
     dense, sparse, empty = ground(0.5, 1.0), ground(0.05, -0.5), LogitHistogram()
-    found = best_threshold([dense, sparse, empty])
+    found = best_threshold([dense, sparse, empty])[0]
     at = int(np.argmin(np.abs(1 / (1 + np.exp(-(dense.logits + 0.025))) - found)))
     mean = (dense.ious() + sparse.ious()) / 2
     assert mean[at] == pytest.approx(mean.max(), abs=1e-9)
     # All pixels in one pot ask the ground with the most building only.
     pot = LogitHistogram(dense.building + sparse.building, dense.other + sparse.other)
-    assert best_threshold([pot]) != pytest.approx(found, abs=0.02)
+    assert best_threshold([pot])[0] != pytest.approx(found, abs=0.02)
     assert sparse.ious()[at] > sparse.ious()[int(np.argmax(pot.ious()))]
-    assert best_threshold([empty]) == 0.5
+    assert best_threshold([empty]) == (0.5, 0.0)
