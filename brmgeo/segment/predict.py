@@ -286,7 +286,7 @@ class Segmenter:
                 same weights that lies beside it; where there is none, torch is the default.
             threads: processor threads; None for all cores.
             looks: 2: the answer is the mean of what the network says of the picture and of its mirror image at 1.25 times
-                its GSD; 1: of the picture alone, in 0.7 of the time; None: as the card's threshold and scores were made.
+                its GSD; 1: of the picture alone, in 0.6 of the time; None: as the card's threshold and scores were made.
 
         Raises InputError for files that are not what they should be, MissingInputError where one is not there, and
         SettingsError for another backend or other looks.
