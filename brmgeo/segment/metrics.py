@@ -199,7 +199,7 @@ class LogitHistogram:
         """(BINS,) float64, the middle of each bin."""
         return np.asarray((np.arange(self.BINS) + 0.5) * 0.05 - self.LIMIT, np.float64)
 
-    def entropy(self, temperature: float, shift: float = 0.0) -> float:
+    def entropy(self, temperature: float, shift: float) -> float:
         """Mean cross-entropy, nats a pixel, of sigmoid((logit + shift) / temperature)."""
         x = (self.logits + shift) / temperature
         cost = self.building * np.logaddexp(0, -x) + self.other * np.logaddexp(0, x)
@@ -228,9 +228,7 @@ class LogitHistogram:
         union = self.building.sum() + np.append(false[1:], 0)
         return np.asarray(np.append(hit[1:], 0) / np.maximum(union, 1), np.float64)
 
-    def reliability(
-        self,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def reliability(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """(mean probability, share of building, pixels) of RELIABILITY_BINS equal bins of probability; NaN in empty ones."""
         p = 1 / (1 + np.exp(-self.logits))
         both = self.building + self.other
