@@ -27,7 +27,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar
 
 import cv2
 import numpy as np
@@ -111,16 +111,62 @@ class Recipe(_Spec):
 
 
 def read_recipe(path: Path) -> Recipe:
-    """The recipe in a file. Raises MissingInputError, or SettingsError in one line, naming file, key and fault."""
+    """The recipe in a file, and in those it is based on.
+
+    ``base = "NAME"`` takes NAME.toml beside the file as it is, but for what the file says itself: tables are merged key by
+    key, sources by name, new ones come last. Raises MissingInputError, or SettingsError in one line, naming file, key and
+    fault.
+    """
     try:
-        return Recipe.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        known = ", ".join(sorted(p.stem for p in path.parent.glob("*.toml"))) or "none"
-        raise MissingInputError(f"{path}: there is no such recipe; there are: {known}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not valid TOML: {error}") from None
+        return Recipe.model_validate(_read_with_base(path, ()))
     except ValidationError as error:
         raise SettingsError(f"{path}: {describe_fault(error, Recipe)}") from None
+
+
+def _read_with_base(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    try:
+        own = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        known = ", ".join(sorted(p.stem for p in path.parent.glob("*.toml"))) or "none"
+        asked = f" (the base of {above[-1].name})" if above else ""
+        raise MissingInputError(f"{path}: there is no such recipe{asked}; there are: {known}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not valid TOML: {error}") from None
+    base = own.pop("base", None)
+    if base is None:
+        return own
+    if not isinstance(base, str) or not base or Path(base).name != base:
+        raise SettingsError(
+            f"{path}: base is {base!r}: give the name of a recipe in the same folder, without .toml"
+        )
+    below = path.with_name(f"{base}.toml")
+    if below in (*above, path):
+        raise SettingsError(f"{path}: base {base!r} leads back to this recipe: take one of the two out")
+    return _merged(_read_with_base(below, (*above, path)), own)
+
+
+def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``own`` over it: tables key by key, lists of tables by their names, anything else replaced."""
+    merged = dict(base)
+    for key, value in own.items():
+        before = base.get(key)
+        if isinstance(before, dict) and isinstance(value, dict):
+            merged[key] = _merged(before, value)
+        elif _are_named(before) and _are_named(value):
+            tables = {table["name"]: table for table in before}
+            for table in value:
+                tables[table["name"]] = _merged(tables.get(table["name"], {}), table)
+            merged[key] = list(tables.values())
+        else:
+            merged[key] = value
+    return merged
+
+
+def _are_named(tables: Any) -> TypeGuard[list[dict[str, Any]]]:
+    if not (isinstance(tables, list) and all(isinstance(table, dict) for table in tables)):
+        return False
+    names = [table.get("name") for table in tables]
+    return all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
 
 
 # --- sources -----------------------------------------------------------------------------------------------------

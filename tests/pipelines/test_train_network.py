@@ -250,6 +250,42 @@ def test_the_projects_recipes_hold_and_never_train_on_what_is_for_testing() -> N
                 assert "sheffield" not in source.name
 
 
+def test_a_recipe_says_only_what_differs_from_its_base(tmp_path: Path) -> None:
+    whole, again = tmp_path / "whole.toml", tmp_path / "again.toml"
+    whole.write_text(TINY)
+    again.write_text(
+        'base = "whole"\ntitle = "again"\n[training]\nsteps = 5\n'
+        '[[source]]\nname = "towns"\nweight = 3.0\n[[source]]\nname = "more"\nkind = "pairs"\n'
+    )
+    base, recipe = network.read_recipe(whole), network.read_recipe(again)
+    assert (recipe.title, recipe.training) == ("again", {**base.training, "steps": 5})
+    assert (recipe.unet, recipe.augment, recipe.work_gsd_m) == (base.unet, base.augment, base.work_gsd_m)
+    first, *others, last = recipe.source
+    assert first == base.source[0].model_copy(update={"weight": 3.0})
+    assert (tuple(others), last.name) == (base.source[1:], "more")
+
+    for text, said in {
+        'base = "none"': r"no such recipe \(the base of again.toml\); there are: again, whole",
+        "base = 3": "base is 3: give the name",
+        'base = "../whole"': "give the name of a recipe in the same folder",
+        'base = "again"': "base 'again' leads back to this recipe",
+        'base = "whole"\n[training]\n[[source]]\nweight = 2.0': "name",
+        'base = "whole"\n[[source]]\nname = []': "name",
+    }.items():
+        again.write_text(text)
+        with pytest.raises((SettingsError, MissingInputError), match=said):
+            network.read_recipe(again)
+    again.write_text(
+        'base = "whole"\n' + 2 * '[[source]]\nname = "towns"\nkind = "generated"\nseeds = [901]\n'
+    )
+    with pytest.raises(SettingsError, match="two sources have this name"):
+        network.train(again, tmp_path, tmp_path / "out")
+    whole.write_text('base = "again"\n' + TINY)
+    again.write_text('base = "whole"')
+    with pytest.raises(SettingsError, match=r"whole.toml: base 'again' leads back"):
+        network.read_recipe(again)
+
+
 def test_recipes_that_are_wrong_are_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "tiny.toml"
     with pytest.raises(MissingInputError, match="no such recipe"):
