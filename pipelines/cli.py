@@ -607,6 +607,7 @@ def localize(
     "0.916), simulated; default: simulated alone, on flights without frames.",
 )
 @weights_option
+@looks_option
 @click.option(
     "--sift",
     is_flag=True,
@@ -634,6 +635,7 @@ def evaluate(
     hide: str | None,
     masks: str | None,
     weights: Path | None,
+    looks: int | None,
     sift: bool,
     season: str | None,
     out: Path | None,
@@ -662,7 +664,11 @@ def evaluate(
     chosen, kinds = (
         tuple(m.strip() for m in (text or "").split(",") if m.strip()) for text in (methods, masks)
     )
-    compared = job.MaskComparison(kinds, weights) if kinds else None
+    if (weights is not None or looks is not None) and "network" not in kinds:
+        raise SettingsError(
+            "evaluate: --weights and --looks are of the network's masks: give --masks network too"
+        )
+    compared = job.MaskComparison(kinds, weights, looks) if kinds else None
     if season is not None and (region is None or not (sift or "network" in kinds)):
         raise SettingsError("evaluate --season: needs a generated REGION, and --sift or --masks network")
     with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:

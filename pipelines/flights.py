@@ -843,11 +843,12 @@ class MaskComparison:
     Attributes:
         kinds: ``true`` (what a perfect network sees in the frame), ``network`` (on rendered frames), ``degraded`` (the true
             ones at the pixel accuracy of the paper's network), ``simulated`` (the simulator's own errors).
-        weights: of the network; None for those that ship.
+        weights, looks: of the network; None for those that ship, and for as many as they ask for.
     """
 
     kinds: tuple[str, ...]
     weights: Path | None = None
+    looks: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -1034,6 +1035,7 @@ def _views_by_masks(
                         float(course.measured_agl_m[i]),
                     ),
                     masks.weights,
+                    masks.looks,
                 )
                 for i, picture in enumerate(_pictures(trial, maps, route, settings, simulator))
             )
@@ -1126,7 +1128,7 @@ def evaluate(
                     f"{maps.folder / 'imagery.tif'} is not there; the network's frames are drawn from imagery"
                 )
             day = f" of another day ({drawn.season})" if drawn.season else ""
-            told["network"] = f"{network_name(masks.weights)} on rendered frames{day}"
+            told["network"] = f"{network_name(masks.weights, masks.looks)} on rendered frames{day}"
         shown = "masks: " + "; ".join(f"{kind}: {told[kind]}" for kind in masks.kinds)
     if sift:
         if maps.imagery is None:

@@ -164,8 +164,8 @@ def above_roofs_m(agl_m: float, roof_m: float) -> float:
 
 
 @functools.lru_cache(maxsize=2)
-def _segmenter(weights: Path | None, threads: int | None) -> Segmenter:
-    return Segmenter.load(weights, threads=threads)
+def _segmenter(weights: Path | None, looks: int | None = None) -> Segmenter:
+    return Segmenter.load(weights, threads=1, looks=looks)
 
 
 def trained_over(card: ModelCard, region: str) -> str:
@@ -190,17 +190,19 @@ def _trained_regions(data: Any) -> Iterator[str]:
 
 def network_warning(weights: Path | None, region: str) -> str:
     """``trained_over`` of the network of these weights; raises as ``Segmenter.load``."""
-    return trained_over(_segmenter(weights, 1).card, region)
+    return trained_over(_segmenter(weights).card, region)
 
 
-def network_name(weights: Path | None) -> str:
+def network_name(weights: Path | None, looks: int | None = None) -> str:
     """What reports call the network of these weights; raises as ``Segmenter.load``."""
-    return f"network {_segmenter(weights, 1).name}"
+    return f"network {_segmenter(weights, looks).name}"
 
 
-def network_mask(picture: NDArray[np.uint8], gsd_m: float, weights: Path | None) -> NDArray[Any]:
+def network_mask(
+    picture: NDArray[np.uint8], gsd_m: float, weights: Path | None, looks: int | None = None
+) -> NDArray[Any]:
     """What ``FrameMasks`` would hand on of a (h, w, 3) RGB frame, on one processor thread, kept nowhere."""
-    segmenter = _segmenter(weights, 1)
+    segmenter = _segmenter(weights, looks)
     probability = _probability(_stored(segmenter.probability(picture, gsd_m)))
     return (
         probability

@@ -283,7 +283,9 @@ def test_the_same_flights_with_several_kinds_of_masks(
     maps: Path, waypoints: Path, weights: Path, tmp_path: Path, say: Say
 ) -> None:
     words = ("evaluate", "--maps", maps, "--out", tmp_path, "--flights", 1, "--path", waypoints)
-    said = say(*words, "--methods", "mask", "--masks", "true,network,degraded", "--weights", weights)
+    said = say(
+        *words, "--methods", "mask", "--masks", "true,network,degraded", "--weights", weights, "--looks", 2
+    )
     assert said.code == 0, said.err
     rows = list(csv.DictReader((tmp_path / "flights.csv").read_text().splitlines()))
     by = {r["method"]: r for r in rows}
@@ -293,9 +295,11 @@ def test_the_same_flights_with_several_kinds_of_masks(
     assert all(int(r["false_fixes"]) == 0 for r in rows)
     assert float(by["mask, network masks"]["rmse_after_first_fix_m"]) < 3
     text = (tmp_path / "summary.md").read_text()
-    assert "network bright abababababab on rendered frames" in text
+    assert "network bright abababababab, two looks on rendered frames" in text
     assert "accuracy of 0.916" in text
     assert "'perfect' is not known" in say(*words, "--masks", "perfect").line
+    for option in (("--weights", weights), ("--looks", 1)):
+        assert "give --masks network too" in say(*words, "--masks", "true", *option).line
 
 
 def test_sift_is_compared_on_the_same_flights(maps: Path, waypoints: Path, tmp_path: Path, say: Say) -> None:
