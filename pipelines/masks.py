@@ -12,6 +12,7 @@ import json
 import math
 import os
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,7 +28,8 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import Geod
-from rasterio.errors import RasterioError
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.errors import FlightError, InputError, MissingInputError, SettingsError
 from brmgeo.export.cog import write_cog
@@ -267,7 +269,8 @@ def _ask(flight: Flight, segmenter: Segmenter, cache: Path, progress: Progress) 
             picture, data = frame_picture(flight, index)
             gsd_m = frame_gsd_m(flight, index)
             path = cache / _key(data, segmenter, picture, gsd_m)
-            if _read_stored(path) is None:
+            stored = _read_stored(path)
+            if stored is None or stored.shape != picture.rgb.shape[:2]:
                 waiting.append((path, picture, gsd_m))
                 asked += 1
             files.append(path)
@@ -360,6 +363,8 @@ def segment(
         raise SettingsError("--bands: give one band or three (red, green, blue) of a raster")
     if gsd_m is not None and (flight or not source.is_dir()):
         raise SettingsError(f"--gsd goes with a plain folder of images; {source} says its own")
+    if gsd_m is not None and not (math.isfinite(gsd_m) and gsd_m > 0):
+        raise SettingsError(f"--gsd {gsd_m:g}: give metres per pixel, above 0")
     if levels is not None and flight:
         raise SettingsError("--levels goes with rasters and plain folders; a flight's frames have 8 bits")
     segmenter = Segmenter.load(weights, backend, looks=looks)
@@ -405,6 +410,12 @@ def _segment_pictures(
     if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / SIGN).is_file()):
         raise SettingsError(
             f"--out {out}: there are other files than masks; give a new folder or an empty one"
+        )
+    others = sorted({p.name for p in out.glob("*.png")} - set(names))
+    if others:
+        raise SettingsError(
+            f"--out {out}: there are masks of other images ({others[0]}{' and others' if others[1:] else ''}); give a new "
+            "folder, or take them away first"
         )
     facts: dict[str, Any] = {
         "source": str(source),
@@ -470,7 +481,7 @@ def segment_raster(
     if not out.absolute().parent.is_dir():
         raise SettingsError(f"--out {out}: there is no folder {out.absolute().parent}; make it first")
     try:
-        with rasterio.open(raster) as src:
+        with _placed_or_not(raster) as src:
             reader = _RasterReader(src, raster, segmenter, levels, bands)
             progress = Progress()
             with progress.stage(f"{raster.name} {answer}") as bar:
@@ -500,6 +511,16 @@ def segment_raster(
     )
 
 
+@contextmanager
+def _placed_or_not(raster: Path) -> Iterator[Any]:
+    """A raster opened without rasterio's warning where it has no place: that is told as an error of its own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        src = rasterio.open(raster)
+    with src:
+        yield src
+
+
 class _RasterReader:
     """An open raster, seen at the network's working GSD."""
 
@@ -511,6 +532,11 @@ class _RasterReader:
         levels: tuple[float, float] | None,
         bands: tuple[int, ...] | None,
     ) -> None:
+        if src.crs is None and path.suffix.lower() in (".jpg", ".jpeg", ".png"):
+            raise InputError(
+                f"{path}: a picture without place or scale, such as a frame: give the folder that holds it, with --gsd "
+                "METRES per pixel where it is not that of the weights"
+            )
         if src.crs is None:
             raise InputError(
                 f"{path}: no coordinate reference system, so nobody knows its scale or place; state it first "
@@ -552,13 +578,23 @@ class _RasterReader:
         down, across = self._scale
         return rasterio.windows.Window(col * across, row * down, width * across, height * down)
 
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        # Told here: within the writing of the result it would pass for a fault of the disk that is written to.
+        try:
+            yield
+        except (RasterioError, CPLE_BaseError) as error:
+            told = " ".join(str(error).split())[:200]
+            raise InputError(f"{self._path}: damaged or cut short ({told}); copy it again") from None
+
     def known(self, row: int, col: int, height: int, width: int) -> NDArray[np.bool_]:
         """(height, width) bool of a window of the working lattice: True where the raster shows something."""
-        mask = self._src.dataset_mask(
-            window=self._window(row, col, height, width),
-            out_shape=(height, width),
-            resampling=rasterio.enums.Resampling.nearest,
-        )
+        with self._reading():
+            mask = self._src.dataset_mask(
+                window=self._window(row, col, height, width),
+                out_shape=(height, width),
+                resampling=rasterio.enums.Resampling.nearest,
+            )
         return np.asarray(mask > 0)
 
     def picture(self, row: int, col: int, height: int, width: int) -> Picture | None:
@@ -570,12 +606,13 @@ class _RasterReader:
         how = rasterio.enums.Resampling.average if shrunk else rasterio.enums.Resampling.cubic
         if self._scale == (1.0, 1.0) or self._palette is not None:
             how = rasterio.enums.Resampling.nearest
-        seen = self._src.read(
-            list(self._bands),
-            window=self._window(row, col, height, width),
-            out_shape=(len(self._bands), height, width),
-            resampling=how,
-        )
+        with self._reading():
+            seen = self._src.read(
+                list(self._bands),
+                window=self._window(row, col, height, width),
+                out_shape=(len(self._bands), height, width),
+                resampling=how,
+            )
         image = np.moveaxis(seen, 0, -1)
         if self._palette is not None:
             image = self._palette[image[:, :, 0]]

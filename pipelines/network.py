@@ -22,6 +22,7 @@ import json
 import math
 import os
 import re
+import shutil
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -369,6 +370,8 @@ def gather(
                 digest.update(hashlib.sha256(scene.image.tobytes() + scene.label.tobytes()).digest())
 
     for spec in _checked(recipe, data, paths, test_regions, say):
+        if spec.kind == "tiles" and spec.split != "test":
+            spec = with_terms(spec, data)
         if spec.split != "test":
             digest.update(spec.model_dump_json(exclude={"attribution", "licence"}).encode())
         if spec.kind == "generated":
@@ -422,6 +425,24 @@ def gather(
                 )
     mixture = Mixture([s for s, _ in train], [w for _, w in train])
     return Ground(mixture, crops, frames["validation"], frames["test"], credits, digest.hexdigest())
+
+
+def with_terms(spec: SourceSpec, data: Path) -> SourceSpec:
+    """A source of tiles with what its regions' files say of attribution and terms, where the recipe says nothing."""
+    from pipelines.maps import credits
+    from pipelines.regions import region_named
+
+    regions = [region_named(name, data)[0] for name in spec.regions]
+    attributions = (credits(region) for region in regions)
+    terms = (region.imagery.terms if region.imagery else "" for region in regions)
+    told = {"attribution": attributions, "licence": terms}
+    return spec.model_copy(
+        update={
+            key: "; ".join(dict.fromkeys(part for part in parts if part))
+            for key, parts in told.items()
+            if not getattr(spec, key)
+        }
+    )
 
 
 def _checked(
@@ -660,6 +681,13 @@ def train(
     # What a first run lacks is said before any ground is painted.
     engine.require_fit(unet, settings)
     initial, before = load_weights(start) if start is not None else (None, None)
+    if before is not None:
+        found, wanted = {"encoder": "plain", **before.settings}, unet.plain()
+        if other := [f"{k} {found.get(k)}, not {v}" for k, v in wanted.items() if found.get(k) != v]:
+            raise InputError(
+                f"{start}: the recipe cannot go on from these weights, which have {', '.join(other)}: "
+                "give its [unet] their settings"
+            )
     if settings.imagenet and initial is None and not engine.checkpoint_of(out).exists():
         imagenet_weights()
     ground = gather(recipe, data, paths or {}, test_regions, augment.finest_m, say)
@@ -728,7 +756,11 @@ def finish(
     state: Mapping[str, Any], unet: Any, recipe: Recipe, augment: AugmentSettings, ground: Ground, out: Path,
     say: Callable[[str], None], steps: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Calibrates on validation frames, scores as ``brmgeo segment`` would answer, writes weights, card and ONNX."""
+    """Calibrates on validation frames, scores as ``brmgeo segment`` would answer, writes weights, card and ONNX.
+
+    All of it is made in a folder of its own and moved to ``out`` when it is whole, the weights first: those of a run that
+    is killed on the way are those of before, or none.
+    """
     from brmgeo.segment.onnx_export import export_onnx
     from brmgeo.segment.predict import LOOKS, Segmenter
     from brmgeo.segment.train import tensors_of
@@ -742,7 +774,10 @@ def finish(
         data={"recipe": recipe.title, "steps": steps, "sources": ground.credits},
         licence=licence_of(ground.credits),
     )  # fmt: skip
-    weights = out / "model.safetensors"
+    made = out / ".finish"
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    weights = made / "model.safetensors"
     save_weights(weights, tensors_of(state), card)
     asked = {
         looks: _histograms(Segmenter.load(weights, "torch", looks=looks), ground.validation)
@@ -788,11 +823,14 @@ def finish(
     # The scores belong into the card; the tensors and with them the answers stay what they are.
     card = replace(card, metrics={"calibration": calibration, **scores})
     save_weights(weights, tensors, card)
-    export_onnx(weights, out / "model.onnx")
-    _draw_reliability(
-        out / "reliability.png",
-        {"as trained": before, "calibrated": after},
-    )
+    export_onnx(weights, made / "model.onnx")
+    _draw_reliability(made / "reliability.png", {"as trained": before, "calibrated": after})
+    # What belongs to other weights goes before they do.
+    for name in ("model.onnx", "metrics.json"):
+        (out / name).unlink(missing_ok=True)
+    for name in ("model.safetensors", "model.md", "model.onnx", "reliability.png"):
+        (made / name).replace(out / name)
+    made.rmdir()
     return {"calibration": calibration, "scores": scores}
 
 
@@ -843,11 +881,13 @@ _OWN_LICENCE = "Apache-2.0 for the weights"
 
 def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
     """One line for the model card: the weights' own licence and what their sources and those of earlier parts ask for."""
-    asked = [
-        f"{c['name']}: " + (f"{c['attribution']} ({c['licence']})" if c.get("attribution") else c["licence"])
-        for c in _with_earlier(credits)
-        if c.get("licence")
-    ]
+    asked = []
+    for credit in _with_earlier(credits):
+        licence, attribution = credit.get("licence"), credit.get("attribution")
+        if not licence and credit.get("kind") in ("tiles", "pairs", "xyz") and credit.get("split") != "test":
+            licence = "terms not stated"
+        if licence:
+            asked.append(f"{credit['name']}: " + (f"{attribution} ({licence})" if attribution else licence))
     return _OWN_LICENCE + ("; trained on " + "; ".join(dict.fromkeys(asked)) if asked else "")
 
 

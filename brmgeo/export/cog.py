@@ -22,10 +22,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import logging
 import math
 import os
 import shutil
+import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -57,6 +59,8 @@ BLOCK_PX = 512
 _SLICE_PX = 2048
 # rasterio takes bytes here. Small, so that GDAL writes as it goes: it must not hold a twentieth of the machine's memory.
 _CACHE_BYTES = 32 << 20
+# Scratch files that nobody has written to for so long are of no living process.
+_STALE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +115,11 @@ def write_cog(
         raise ValueError(f"{len(names)} band descriptions for {count} bands")
 
     path = Path(path)
+    hidden = f".{glob.escape(path.name)}.{12 * '[0-9a-f]'}"
+    for old in (*path.parent.glob(f"{hidden}.blocks.tif*"), *path.parent.glob(f"{hidden}.part*")):
+        with contextlib.suppress(OSError):  # another process may clear it away just now
+            if time.time() - old.stat().st_mtime > _STALE_S:
+                old.unlink()
     stem = f".{path.name}.{uuid.uuid4().hex[:12]}"
     scratch, part = path.with_name(f"{stem}.blocks.tif"), path.with_name(f"{stem}.part")
     pieces = _sliced(data, (rows, cols)) if isinstance(data, (np.ndarray, tuple)) else data
@@ -181,7 +190,7 @@ def write_cog(
         raise _unwritable(path, error) from error
     finally:
         # GDAL leaves its own scratch files (overviews, masks) beside the part file when it is stopped.
-        for left in path.parent.glob(f"{stem}*"):
+        for left in path.parent.glob(f"{glob.escape(stem)}*"):
             left.unlink(missing_ok=True)
     return stats
 

@@ -187,12 +187,11 @@ class LogitHistogram:
     def add(self, logits: F32, label: U8) -> None:
         """Counts the known pixels of (h, w) float32 logits and their uint8 label; NaN logits are left out."""
         usable = np.isfinite(logits) & (label != UNKNOWN)
-        index = np.floor(
-            (np.clip(logits[usable], -self.LIMIT, self.LIMIT - 1e-6) + self.LIMIT) / 0.05
-        ).astype(int)
+        shown = np.clip(logits[usable].astype(np.float64), -self.LIMIT, self.LIMIT)
+        index = np.minimum(np.floor((shown + self.LIMIT) / 0.05).astype(int), self.BINS - 1)
         truth = label[usable] == BUILDING
-        self.building += np.bincount(index[truth], minlength=self.BINS)[: self.BINS]
-        self.other += np.bincount(index[~truth], minlength=self.BINS)[: self.BINS]
+        self.building += np.bincount(index[truth], minlength=self.BINS)
+        self.other += np.bincount(index[~truth], minlength=self.BINS)
 
     @property
     def logits(self) -> NDArray[np.float64]:

@@ -278,6 +278,18 @@ def test_a_failing_block_leaves_the_old_file(tmp_path: Path, ratio: NDArray[np.u
     assert [p.name for p in tmp_path.iterdir()] == ["r.tif"]
 
 
+def test_what_a_killed_run_left_long_ago_is_cleared_away(tmp_path: Path, ratio: NDArray[np.uint16]) -> None:
+    names = ("blocks.tif", "part", "part.ovr.tmp")
+    old, young = ([tmp_path / f".r[1].tif.{12 * letter}.{name}" for name in names] for letter in ("a", "b"))
+    foreign = [tmp_path / ".r[1].tif.mine.part", tmp_path / f".r1.tif.{12 * 'a'}.part"]
+    for path in (*old, *young, *foreign):
+        path.touch()
+        if path not in young:
+            os.utime(path, (1e9, 1e9))
+    write_cog(tmp_path / "r[1].tif", ratio, BOX, kind="ratio", radii_m=RADII)
+    assert {*tmp_path.iterdir()} == {tmp_path / "r[1].tif", *young, *foreign}
+
+
 WRITE = """
 import sys, numpy as np, resource, os
 from pathlib import Path

@@ -118,9 +118,11 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
     assert len(asked) == len(first)
     assert ask(pictured, weights) == first
     assert not asked
-    sorted(p for p in cache.rglob("*") if p.is_file())[0].write_bytes(b"damaged")
-    assert ask(pictured, weights) == first
-    assert len(asked) == 1
+    kept = sorted(p for p in cache.rglob("*") if p.is_file())[0]
+    for damage in (b"damaged", cv2.imencode(".png", np.zeros((10, 10), np.uint8))[1].tobytes()):
+        kept.write_bytes(damage)
+        assert ask(pictured, weights) == first
+        assert len(asked) == 1
     flight = Path(shutil.copytree(pictured, tmp_path / "f"))
     frame = flight / "frames" / frames_of(flight)[3]
     cv2.imwrite(str(frame), cv2.imread(str(frame))[::-1])
@@ -374,6 +376,14 @@ def test_segment_a_flight_and_a_folder(
         "no images" in say("segment", tmp_path / "none", "--weights", weights, "--out", tmp_path / "q").line
     )
     assert "--gsd goes with" in say("segment", pictured, *words[2:]).line
+    new = tmp_path / "new"
+    assert "--gsd -1: give metres" in say(*words[:-3], -1, "--out", new).line
+    assert not new.exists()
+    # Masks of other images never lie among those that masks.json tells of.
+    (folder / "z.png").rename(folder / "y.png")
+    before = bytes_of(tmp_path / "k")
+    assert "masks of other images (z.png)" in say(*killed).line
+    assert bytes_of(tmp_path / "k") == before
 
 
 # ---------------------------------------------------------------- rasters
@@ -536,6 +546,13 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
     write_raster(tmp_path / "tiny.tif", image[:8])
     cut = tmp_path / "cut.tif"
     cut.write_bytes(whole.read_bytes()[:5000])
+    # Blocks beyond the end of the file: it opens, and fails where it is read.
+    large = write_raster(
+        tmp_path / "large.tif", np.tile(image, (4, 4, 1)), tiled=True, blockxsize=64, blockysize=64
+    )
+    data = large.read_bytes()
+    large.write_bytes(data[: len(data) * 6 // 10])
+    cv2.imwrite(str(tmp_path / "frame.jpg"), image)
     (tmp_path / "text.tif").write_text("no raster")
     out = tmp_path / "m.tif"
     cases = {
@@ -545,6 +562,8 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
         "deep.tif": ((), "--levels LOW,HIGH"),
         "tiny.tif": ((), "at least 16 px"),
         "cut.tif": ((), "cut.tif"),
+        "large.tif": ((), "large.tif: damaged or cut short"),
+        "frame.jpg": ((), "such as a frame: give the folder that holds it"),
         "text.tif": ((), "not a readable raster"),
         "whole.tif": (("--bands", "1,2,9"), "has bands 1 to 3"),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import types
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from brmgeo.flight.view import raised
 from brmgeo.region import load_region
 from brmgeo.segment.augment import AugmentSettings
 from brmgeo.segment.metrics import LogitHistogram
-from brmgeo.segment.predict import Segmenter
+from brmgeo.segment.predict import SHIPPED, Segmenter
 from brmgeo.segment.shards import TileInfo
 from brmgeo.segment.unet import UNet, UNetSettings
 from pipelines import network, training
@@ -218,6 +219,35 @@ def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:
         assert network.licence_of([{**foreign, "data": {"sources": sources}}]) == (
             f"Apache-2.0 for the weights; trained on weights 89ab: CC BY-NC 4.0{more}"
         )
+
+
+def test_terms_of_training_tiles_are_those_of_their_regions(tmp_path: Path) -> None:
+    (tmp_path / "regions").mkdir()
+    for name in ("town-a", "town-b", "kampala"):
+        shutil.copy(ROOT / "data" / "regions" / f"{name}.toml", tmp_path / "regions")
+    real = network.SourceSpec(name="mine", kind="tiles", regions=("kampala",))
+    (told,) = [network.with_terms(real, tmp_path).model_dump()]
+    assert network.licence_of([told]) == (
+        "Apache-2.0 for the weights; trained on mine: (c) OpenStreetMap contributors, ODbL 1.0; "
+        "OpenAerialMap contributors, CC BY 4.0 (CC BY 4.0)"
+    )
+    own = network.SourceSpec(name="own", kind="tiles", regions=("town-a", "town-b"))
+    assert network.with_terms(own, tmp_path).licence == "Apache-2.0, as brmgeo"
+    said = own.model_copy(update={"licence": "mine", "attribution": "me"})
+    assert network.with_terms(said, tmp_path) == said
+    # What nobody states is not taken for free.
+    pairs = {"name": "far", "kind": "pairs", "split": "train"}
+    assert network.licence_of([pairs]).endswith("trained on far: terms not stated")
+    assert network.licence_of([{**pairs, "split": "test"}]) == "Apache-2.0 for the weights"
+
+
+def test_weights_of_another_network_are_refused_before_any_ground_is_painted(tmp_path: Path) -> None:
+    recipe = tmp_path / "tiny.toml"
+    recipe.write_text(TINY)
+    shipped = SHIPPED.with_suffix(".safetensors")
+    with pytest.raises(InputError, match=r"building-unet.safetensors: .* widths \[16, 24, .*, not \[8, 16\]"):
+        network.train(recipe, tmp_path, tmp_path / "out", start=shipped)
+    assert {*tmp_path.iterdir()} == {recipe}
 
 
 def test_a_generated_scene_is_painted_once_and_labels_its_roofs(tmp_path: Path) -> None:
@@ -464,6 +494,32 @@ def test_weights_are_for_the_looks_that_validation_asks_for(
     )  # fmt: skip
     assert facts["calibration"]["looks"] == better
     assert Segmenter.load(tmp_path / "model.safetensors").looks == better
+
+
+def test_a_run_that_ends_while_it_finishes_leaves_the_weights_of_before(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recipe, out = tmp_path / "tiny.toml", tmp_path / "out"
+    recipe.write_text(TINY)
+    network.train(recipe, tmp_path, out, say=lambda _: None)
+    before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    # Weights, calibration and ONNX are made by then, all but the scores' picture.
+    monkeypatch.setattr(network, "_draw_reliability", killed)
+    with pytest.raises(KeyboardInterrupt):
+        network.train(recipe, tmp_path, out, say=lambda _: None)
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
+    with pytest.raises(KeyboardInterrupt):
+        network.train(recipe, tmp_path, tmp_path / "fresh", say=lambda _: None)
+    assert not list((tmp_path / "fresh").glob("model*"))
+    monkeypatch.undo()
+    network.train(recipe, tmp_path, out, say=lambda _: None)
+    after = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    assert {name for name, data in before.items() if after.get(name) != data} <= {"metrics.json"}
+    assert not (out / ".finish").exists()
 
 
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -134,6 +134,14 @@ def overconfident() -> tuple[LogitHistogram, np.ndarray, np.ndarray]:
     return histogram, logits, truth
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("logit", [15.999999, 16.0, 17.0, 3e4, -16.0, -17.0])
+def test_logits_beyond_the_limit_count_as_it(logit: float, dtype: type) -> None:
+    histogram = LogitHistogram()
+    histogram.add(np.full((3, 4), logit, dtype), np.full((3, 4), 255, np.uint8))
+    assert histogram.building[-1 if logit > 0 else 0] == histogram.building.sum() == 12
+
+
 def test_calibration_undoes_overconfidence_and_a_shift(
     overconfident: tuple[LogitHistogram, np.ndarray, np.ndarray],
 ) -> None:
