@@ -65,13 +65,15 @@ class ImagerySettings(_Settings):
     """Where imagery comes from.
 
     ``kind``: ``tiles`` (a folder), ``mbtiles``, ``service`` (a URL template of the user's own, with the terms that
-    the user has checked) or ``raster`` (GeoTIFFs, world files, NGII ortho named by sheet number).
+    the user has checked) or ``raster`` (GeoTIFFs, world files, NGII ortho named by sheet number). ``pixel_ratio`` 2:
+    tiles of 512 px where the grid's have 256.
     """
 
     kind: Literal["tiles", "mbtiles", "service", "raster"]
     path: str = "tiles"
     grid: Literal["kakao", "webmercator"] = "kakao"
     level: Annotated[int, Field(ge=0, le=24)] | None = None
+    pixel_ratio: Literal[1, 2] = 1
     template: str | None = None
     url: str | None = None
     key_env: str | None = None

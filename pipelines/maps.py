@@ -335,9 +335,10 @@ def imagery_sources(source: str, root: str) -> list[Any]:
     base = Path(root)
     if settings["kind"] in ("tiles", "service"):
         folder = base / settings["member"] if settings["member"] else base
-        return [TileFolder(folder, grid_named(settings["grid"]), settings["level"], settings["template"])]
+        grid, ratio = grid_named(settings["grid"]), settings.get("pixel_ratio", 1)
+        return [TileFolder(folder, grid, settings["level"], settings["template"], pixel_ratio=ratio)]
     if settings["kind"] == "mbtiles":
-        return [MBTiles.open(base, settings["level"])]
+        return [MBTiles.open(base, settings["level"], settings.get("pixel_ratio", 1))]
     found: list[Any] = []
     for path in (base / name for name in settings["files"]):
         number = sheet_number_in(path.name)
@@ -706,6 +707,8 @@ def _imagery_settings(given: ImagerySettings, member: str = "", files: Sequence[
         "crs": given.crs,
         "value_range": given.value_range,
         "bands": given.bands,
+        # Only where it is stated, so that what was made before there was a choice stays fresh.
+        **({"pixel_ratio": given.pixel_ratio} if given.pixel_ratio != 1 else {}),
     }
 
 
@@ -731,10 +734,12 @@ def _imagery_inputs(
 
     source: TileSource
     if given.kind == "mbtiles":
-        source = MBTiles.open(path, given.level)
+        source = MBTiles.open(path, given.level, given.pixel_ratio)
     else:
         assert given.level is not None
-        source = TileFolder(path, grid_named(given.grid), given.level, given.template)
+        source = TileFolder(
+            path, grid_named(given.grid), given.level, given.template, pixel_ratio=given.pixel_ratio
+        )
     ensure_tiles(source, place_of(region), region.crs, missing_ok=given.missing_share)
     return {"imagery": path}, _imagery_settings(given)
 
@@ -775,6 +780,7 @@ def _service_tiles(region: Region, given: ImagerySettings, source_dir: Path, fet
         attribution=given.attribution,
         terms=given.terms,
         missing_ok=given.missing_share,
+        pixel_ratio=given.pixel_ratio,
     )
     with Progress().stage("imagery tiles") as bar:
         ensure_tiles(service, place_of(region), region.crs, progress=bar.update)

@@ -431,6 +431,9 @@ def _segment_pictures(
     }
     progress = Progress()
     share = 0.0
+    # A picture or a scale that cannot be is told before there is a folder.
+    rows, cols, _ = jobs[0].picture().rgb.shape
+    segmenter.working_size((rows, cols), jobs[0].gsd_m)
     # Before the masks, so that the same command may go on where one was killed.
     _write_facts(out, facts)
     with progress.stage("masks") as bar:

@@ -15,6 +15,7 @@ Folders that are not part of the project are given with ``--source NAME=PATH``.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -41,7 +42,7 @@ from brmgeo.flight.folder import read_flight
 from brmgeo.flight.view import raised
 from brmgeo.geo.grid import lattice
 from brmgeo.maps.rasterize import building_mask
-from brmgeo.region import describe_fault
+from brmgeo.region import describe_fault, load_region
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, shrunk
 from brmgeo.segment.metrics import LogitHistogram, Scores, best_threshold, segmentation_scores
 from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles
@@ -480,11 +481,18 @@ def _checked(
             raise SettingsError(
                 f"recipe: region {region} is named twice; its tiles are cut for one purpose, so name it once"
             )
+    held = _held_seeds(data)
     used = []
     for spec in (*recipe.source, *own):
         if (spec.kind == "generated" and not spec.seeds) or (spec.kind == "tiles" and not spec.regions):
             needs = "seeds" if spec.kind == "generated" else "regions"
             raise SettingsError(f"recipe source {spec.name}: is of kind {spec.kind} and names no {needs}")
+        if spec.kind == "generated" and spec.split != "test" and (same := set(held).intersection(spec.seeds)):
+            seed = min(same)
+            raise SettingsError(
+                f"recipe source {spec.name}: seed {seed} is that of region {held[seed]}, which is held out for tests; "
+                "take it out"
+            )
         if spec.kind == "flight" and spec.split != "test":
             raise SettingsError(f'recipe source {spec.name}: a flight is for tests only: split = "test"')
         if spec.roof_m and spec.kind != "flight":
@@ -502,6 +510,19 @@ def _checked(
                 f"recipe {recipe.title!r} trains on {spec.name}: give its folder, --source {spec.name}=PATH"
             )
     return used
+
+
+def _held_seeds(data: Path) -> dict[int, str]:
+    """Seeds of the generated regions that are held out for tests, with the regions' names."""
+    found = {}
+    for path in sorted((data / "regions").glob("[!_]*.toml")):
+        with contextlib.suppress(
+            InputError, SettingsError
+        ):  # a faulty file is told when its region is asked for
+            region = load_region(path)
+            if region.generate and region.training.hold_out:
+                found[region.generate.seed] = region.name
+    return found
 
 
 def _reduced(scene: Scene, finest_m: float) -> Scene:

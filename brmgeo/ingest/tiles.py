@@ -351,7 +351,9 @@ def decode_tile(data: bytes, size_px: int) -> tuple[NDArray[np.uint8], str]:
                 raise ValueError(
                     f"it has {image.size[0]} x {image.size[1]} px, wanted {size_px} x {size_px}{hint}"
                 )
-            if image.mode.startswith(("I", "F")):
+            # Pillow opens a PNG of 16-bit colours as one of 8 and keeps the upper half of each; its header knows better.
+            deep = kind == "PNG" and data[24:25] > b"\x08"
+            if deep or image.mode.startswith(("I", "F")):
                 raise ValueError(f"it has 16-bit or float pixels (mode {image.mode}), wanted 8-bit colours")
             image.load()
             return np.asarray(image.convert("RGBA"), dtype=np.uint8), kind

@@ -103,7 +103,7 @@ def require_whole(path: Path, data: bytes) -> None:
                 shown.load()
     except Image.DecompressionBombError:
         raise InputError(
-            f"{path}: too many pixels for a frame: make a GeoTIFF of it, which is read in parts"
+            f"{path}: too many pixels for one picture: cut it into parts, or segment it as a georeferenced raster"
         ) from None
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.

@@ -188,7 +188,8 @@ def write_index(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _read_index(path: Path) -> Iterator[tuple[TileInfo, _Place]]:
-    with path.open(encoding="utf-8", newline="") as file:
+    # Bytes that are no text become marks that fit no number and no name.
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
         reader = csv.reader(file)
         if tuple(next(reader, ())) != COLUMNS:
             raise InputError(
@@ -204,7 +205,7 @@ def _read_index(path: Path) -> Iterator[tuple[TileInfo, _Place]]:
                     ),
                     _Place(row[12], *(int(v) for v in row[13:19])),
                 )  # fmt: skip
-            except (ValueError, IndexError, TypeError):
+            except (ValueError, IndexError, TypeError, OverflowError):
                 raise InputError(f"{path}, line {number}: is damaged; cut the tiles again") from None
 
 
@@ -300,7 +301,7 @@ def read_tiles(folder: Path | str) -> TileSet:
         raise InputError(f"{index}: is not there; cut the tiles again")
     shards = facts.get("shards")
     if not isinstance(shards, list) or not all(
-        isinstance(s, dict) and {"file", "size"} <= s.keys() for s in shards
+        isinstance(s, dict) and {"file", "size"} <= s.keys() and type(s["size"]) is int for s in shards
     ):
         raise InputError(f"{path}: its list of shards is damaged; cut the tiles again")
     for shard in shards:
@@ -315,6 +316,13 @@ def read_tiles(folder: Path | str) -> TileSet:
             raise InputError(
                 f"{index}: tile {info.key} names shard {info.shard}, split {info.split}; cut the tiles again"
             )
+        most = int(shards[info.shard]["size"])
+        for offset, size in ((place.image_offset, place.image_size), (place.label_offset, place.label_size)):
+            if not (offset >= 0 and 0 < size <= most - offset):
+                raise InputError(
+                    f"{index}: tile {info.key} lies at byte {offset} with {size} bytes, its shard has {most}; "
+                    "cut the tiles again"
+                )
         infos.append(info)
         places.append(place)
     if len(infos) != facts.get("tiles"):

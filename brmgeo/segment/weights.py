@@ -208,6 +208,9 @@ def load_weights(path: Path) -> tuple[dict[str, NDArray[Any]], ModelCard]:
             f"{path}: the tensors or the card are not those that were written (SHA-256 differs): damaged or "
             "changed; copy the file again"
         )
+    for name, value in tensors.items():
+        if not np.isfinite(value).all():
+            raise InputError(f"{path}: tensor {name} holds values that are no numbers: give other weights")
     return tensors, card
 
 

@@ -16,6 +16,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -370,6 +371,10 @@ def test_bad_tiles_are_named(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((256, 256), np.uint16)).save(path)
     with pytest.raises(InputError, match="16-bit"):
         folder.read(Tile(6, 5))
+    for channels in (3, 4):  # which Pillow opens as 8-bit colours
+        path.write_bytes(cv2.imencode(".png", np.full((256, 256, channels), 1700, np.uint16))[1].tobytes())
+        with pytest.raises(InputError, match="16-bit"):
+            folder.read(Tile(6, 5))
     Image.fromarray(np.zeros((256, 256), np.uint8)).save(path.with_suffix(".gif"))
     path.write_bytes(path.with_suffix(".gif").read_bytes())
     with pytest.raises(InputError, match="GIF, not PNG"):

@@ -10,7 +10,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rasterio
+from PIL import Image
 from small_maps import SHEETS, SmallRegion, brmgeo, rasters_of
 
 from pipelines import maps
@@ -90,6 +93,24 @@ def test_changed_sheets_and_tiles_are_noticed_by_content(
     assert (
         "has no stage 'nonsense'" in brmgeo(capsys, "why", "small", "nonsense", "--data", region.data).error
     )
+
+
+def test_tiles_of_twice_the_pixels_are_taken_where_the_region_says_so(
+    built: SmallRegion, tmp_path: Path, capsys: Capture
+) -> None:
+    region = built.copied_to(tmp_path / "data")
+    for path in region.tiles.rglob("*.png"):
+        with Image.open(path) as tile:
+            tile.resize((512, 512), Image.Resampling.NEAREST).save(path)
+    said = brmgeo(capsys, "maps", "small", "--data", region.data)
+    assert "512 x 512 px, wanted 256 x 256: state pixel_ratio = 2" in said.error
+    region.edit("level =", "pixel_ratio = 2\nlevel =")
+    assert brmgeo(capsys, "maps", "small", "--data", region.data).status == 0
+    pictures = []
+    for out in (built.out, region.out):
+        with rasterio.open(out / "imagery.tif") as src:
+            pictures.append(src.read().astype(float))
+    assert np.abs(pictures[0] - pictures[1]).mean() < 2.0
 
 
 def test_damage_in_the_store_is_found_and_mended(built: SmallRegion, tmp_path: Path, capsys: Capture) -> None:

@@ -377,8 +377,9 @@ def test_segment_a_flight_and_a_folder(
     )
     assert "--gsd goes with" in say("segment", pictured, *words[2:]).line
     new = tmp_path / "new"
-    assert "--gsd -1: give metres" in say(*words[:-3], -1, "--out", new).line
-    assert not new.exists()
+    for gsd, told in ((-1, "--gsd -1: give metres"), (99, "too coarse")):
+        assert told in say(*words[:-3], gsd, "--out", new).line
+        assert not new.exists()
     # Masks of other images never lie among those that masks.json tells of.
     (folder / "z.png").rename(folder / "y.png")
     before = bytes_of(tmp_path / "k")

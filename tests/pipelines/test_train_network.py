@@ -221,6 +221,20 @@ def test_the_card_names_the_terms_of_what_it_went_on_from() -> None:
         )
 
 
+def test_seeds_of_held_out_regions_are_not_trained_on(tmp_path: Path) -> None:
+    (tmp_path / "regions").mkdir()
+    shutil.copy(ROOT / "data" / "regions" / "demo.toml", tmp_path / "regions")
+    (tmp_path / "regions" / "faulty.toml").write_text("no region")
+    for split in ("train", "validation"):
+        text = TINY.replace('split = "validation"', "").replace(
+            "seeds = [901]", f'seeds = [1, 901]\nsplit = "{split}"'
+        )
+        with pytest.raises(SettingsError, match="seed 1 is that of region demo, which is held out"):
+            gather(text, tmp_path)
+    with pytest.raises(SettingsError, match="names no ground to train on"):
+        gather(TINY.replace("seeds = [901]", 'seeds = [1]\nsplit = "test"'), tmp_path)
+
+
 def test_terms_of_training_tiles_are_those_of_their_regions(tmp_path: Path) -> None:
     (tmp_path / "regions").mkdir()
     for name in ("town-a", "town-b", "kampala"):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError
 from brmgeo.segment.shards import (
+    COLUMNS,
     INDEX_CSV,
     ShardWriter,
     TileInfo,
@@ -138,6 +139,15 @@ def damaged(folder: Path, what: str) -> None:
     elif what == "index row":
         text = (folder / INDEX_CSV).read_text().replace(",0.25,", ",a quarter,", 1)
         (folder / INDEX_CSV).write_text(text)
+    elif what == "index bytes":
+        data = (folder / INDEX_CSV).read_bytes()
+        (folder / INDEX_CSV).write_bytes(data.replace(b",0.25,", b",\xff\xfe,", 1))
+    elif what in ("offset", "size"):
+        lines = (folder / INDEX_CSV).read_text().splitlines(keepends=True)
+        row = lines[1].split(",")
+        column = COLUMNS.index(f"image_{what}")
+        row[column] = {"offset": "-1", "size": str(10**15)}[what]
+        (folder / INDEX_CSV).write_text("".join([lines[0], ",".join(row), *lines[2:]]))
     elif what == "index short":
         lines = (folder / INDEX_CSV).read_text().splitlines(keepends=True)
         (folder / INDEX_CSV).write_text("".join(lines[:-1]))
@@ -162,6 +172,9 @@ def damaged(folder: Path, what: str) -> None:
         ("no index", "is not there"),
         ("index header", "not the index of training tiles"),
         ("index row", "line 2"),
+        ("index bytes", "line 2"),
+        ("offset", "lies at byte -1"),
+        ("size", "1000000000000000 bytes, its shard has"),
         ("index short", "lists 6 tiles"),
         ("shard gone", "is not there"),
         ("shard short", "bytes are recorded"),

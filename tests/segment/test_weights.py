@@ -91,6 +91,13 @@ def test_the_network_of_a_file_answers_as_the_one_that_was_saved(weights: Path) 
         assert torch.equal(saved(x), loaded(x))
 
 
+def not_a_number(path: Path) -> None:
+    tensors, card = load_weights(path)
+    spoilt = {name: np.array(value) for name, value in tensors.items()}
+    spoilt["head.bias"][0] = np.nan
+    save_weights(path, spoilt, card)
+
+
 def flip(at: Callable[[bytes], int]) -> Callable[[Path], object]:
     def change(path: Path) -> None:
         data = bytearray(path.read_bytes())
@@ -137,6 +144,7 @@ def card_of(**changes: object) -> Callable[[Path], object]:
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "a byte of a tensor": (flip(lambda data: len(data) - 5), "SHA-256 differs"),
     "a byte of the threshold": (flip(lambda data: data.index(b"0.45") + 3), "SHA-256 differs"),
+    "no numbers": (not_a_number, "tensor head.bias holds values that are no numbers"),
     "another threshold": (card_of(threshold=0.6), "SHA-256 differs"),
     "other settings": (card_of(settings={"widths": [8, 24], "norm": "batch", "in_channels": 3}), "SHA-256"),
     "cut short": (cut, "not a whole safetensors file"),
