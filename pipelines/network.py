@@ -4,7 +4,8 @@ A recipe is a TOML file (data/recipes): the U-Net, the training run, the augment
 of one of these kinds:
 
 - ``generated``: towns that brmgeo invents, by seed, painted once and kept in data/work/scenes;
-- ``tiles``: training tiles of regions by name, as ``brmgeo tiles`` cuts them (cut now where they are not as wanted);
+- ``tiles``: training tiles of regions by name, as ``brmgeo tiles`` cuts them (cut now where they are not as wanted), or,
+  without ``regions``, those in a folder, such as ``brmgeo tiles --pairs`` makes;
 - ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
 - ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
 - ``flight``: a flight folder whose frames have masks; for tests only. Masks of outlines on the ground are scored as they are
@@ -372,7 +373,7 @@ def gather(
 
     for spec in _checked(recipe, data, paths, test_regions, say):
         if spec.kind == "tiles" and spec.split != "test":
-            spec = with_terms(spec, data)
+            spec = with_terms(spec, data, paths)
         if spec.split != "test":
             digest.update(spec.model_dump_json(exclude={"attribution", "licence"}).encode())
         if spec.kind == "generated":
@@ -400,7 +401,9 @@ def gather(
         elif spec.kind == "flight":
             frames["test"][spec.name] = _flight_frames(paths[spec.name], spec.roof_m)
         else:
-            for part, weight, source, pictures, seen_digest in _tile_sources(spec, data, recipe.work_gsd_m):
+            for part, weight, source, pictures, seen_digest in _tile_sources(
+                spec, data, paths, recipe.work_gsd_m
+            ):
                 if part == "train":
                     train.append((source, weight))
                 else:
@@ -428,20 +431,25 @@ def gather(
     return Ground(mixture, crops, frames["validation"], frames["test"], credits, digest.hexdigest())
 
 
-def with_terms(spec: SourceSpec, data: Path) -> SourceSpec:
-    """A source of tiles with what its regions' files say of attribution and terms, where the recipe says nothing."""
+def with_terms(spec: SourceSpec, data: Path, paths: Mapping[str, Path]) -> SourceSpec:
+    """A source of tiles with what its regions' files, or its folder, say of attribution and terms."""
     from pipelines.maps import credits
     from pipelines.regions import region_named
 
-    regions = [region_named(name, data)[0] for name in spec.regions]
-    attributions = (credits(region) for region in regions)
-    terms = (region.imagery.terms if region.imagery else "" for region in regions)
-    told = {"attribution": attributions, "licence": terms}
+    if not spec.regions:
+        sources = read_tiles(paths[spec.name]).facts.get("sources") or []
+        told = {"attribution": [s["attribution"] for s in sources], "licence": [s["terms"] for s in sources]}
+    else:
+        regions = [region_named(name, data)[0] for name in spec.regions]
+        told = {
+            "attribution": [credits(region) for region in regions],
+            "licence": [region.imagery.terms if region.imagery else "" for region in regions],
+        }
     return spec.model_copy(
         update={
             key: "; ".join(dict.fromkeys(part for part in parts if part))
             for key, parts in told.items()
-            if not getattr(spec, key)
+            if not getattr(spec, key)  # what the recipe says counts
         }
     )
 
@@ -456,7 +464,11 @@ def _checked(
     """The sources to be read, all looked at before the first is painted or read; see ``gather`` for what is raised."""
     from pipelines import training
 
-    names = {s.name for s in recipe.source if s.kind in ("pairs", "xyz", "flight")}
+    names = {
+        s.name
+        for s in recipe.source
+        if s.kind in ("pairs", "xyz", "flight") or (s.kind == "tiles" and not s.regions)
+    }
     for name in paths:
         if name not in names:
             raise SettingsError(
@@ -484,9 +496,8 @@ def _checked(
     held = _held_seeds(data)
     used = []
     for spec in (*recipe.source, *own):
-        if (spec.kind == "generated" and not spec.seeds) or (spec.kind == "tiles" and not spec.regions):
-            needs = "seeds" if spec.kind == "generated" else "regions"
-            raise SettingsError(f"recipe source {spec.name}: is of kind {spec.kind} and names no {needs}")
+        if spec.kind == "generated" and not spec.seeds:
+            raise SettingsError(f"recipe source {spec.name}: is of kind generated and names no seeds")
         if spec.kind == "generated" and spec.split != "test" and (same := set(held).intersection(spec.seeds)):
             seed = min(same)
             raise SettingsError(
@@ -501,6 +512,15 @@ def _checked(
             raise SettingsError(f"recipe source {spec.name}: pairs are for training, and need their gsd_m")
         if spec.kind == "tiles":
             training.require_all_trainable(spec.regions, data, spec.split)
+            if (
+                spec.name in paths
+                and spec.split != "test"
+                and read_tiles(paths[spec.name]).facts.get("hold_out")
+            ):
+                raise SettingsError(
+                    f"recipe source {spec.name}: the tiles in {paths[spec.name]} are of a held-out region; "
+                    'name another folder, or give split = "test"'
+                )
         if spec.name not in names or spec.name in paths:
             used.append(spec)
         elif spec.split == "test":
@@ -580,33 +600,45 @@ def _flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
     ]
 
 
-def _tile_sources(
-    spec: SourceSpec, data: Path, work_gsd_m: float
-) -> Iterator[tuple[str, float, Source, list[Picture], bytes]]:
-    """(split, weight, source, frames, digest) of each region's tiles, which are cut for that, or found to be.
-
-    Tiles that are for training are divided as the region file says; those that are not are all of the one split.
-    Raises SettingsError for a region without tiles to train on.
-    """
+def _tile_sets(spec: SourceSpec, data: Path, paths: Mapping[str, Path]) -> Iterator[tuple[str, TileSet]]:
+    """What the tiles are called, and the tiles: of each region, cut for this or found to be, or of the source's folder."""
     from pipelines import training
 
+    if not spec.regions:
+        yield str(paths[spec.name]), read_tiles(paths[spec.name])
     for region in spec.regions:
         # A cut that is fresh costs nothing; one for another purpose, such as --split test, must not be trained on.
         align = training.last_aligned(region, data)
         whole = None if spec.split == "train" else spec.split
-        tiles = read_tiles(training.cut_region(region, data, None, None, whole, align=align))
-        share = spec.weight / len(spec.regions)
-        if whole is None and not tiles.of_split("train"):
-            raise SettingsError(
-                f"recipe source {spec.name}: region {region} has no tile to train on (its [training] split is for other "
-                'uses); take it out, or set split = "blocks" in its region file'
-            )
-        for split in ("train", "validation") if whole is None else (whole,):
-            chosen = tiles.of_split(split)
-            if not chosen:
-                continue
-            frames = _tile_frames(tiles, chosen, work_gsd_m)
-            yield split, share, Tiles(tiles, chosen), frames, tiles.digest(chosen)
+        yield (
+            f"region {region}",
+            read_tiles(training.cut_region(region, data, None, None, whole, align=align)),
+        )
+
+
+def _tile_sources(
+    spec: SourceSpec, data: Path, paths: Mapping[str, Path], work_gsd_m: float
+) -> Iterator[tuple[str, float, Source, list[Picture], bytes]]:
+    """(split, weight, source, frames, digest) of each set of tiles.
+
+    Those that are for training are divided as their own splits say; those that are not are all of the one split.
+    Raises SettingsError for a set without tiles to train on.
+    """
+    share = spec.weight / max(len(spec.regions), 1)
+    for what, tiles in _tile_sets(spec, data, paths):
+        if spec.split == "train":
+            parts = {split: tiles.of_split(split) for split in ("train", "validation")}
+            if not parts["train"]:
+                raise SettingsError(
+                    f"recipe source {spec.name}: {what} has no tile to train on (its split is for other uses); take it out, "
+                    'or set split = "blocks" in its region file'
+                )
+        else:
+            parts = {spec.split: list(range(len(tiles)))}
+        for split, chosen in parts.items():
+            if chosen:
+                frames = _tile_frames(tiles, chosen, work_gsd_m)
+                yield split, share, Tiles(tiles, chosen), frames, tiles.digest(chosen)
 
 
 def _tile_frames(tiles: TileSet, chosen: Sequence[int], work_gsd_m: float) -> list[Picture]:

@@ -231,8 +231,6 @@ def test_seeds_of_held_out_regions_are_not_trained_on(tmp_path: Path) -> None:
         )
         with pytest.raises(SettingsError, match="seed 1 is that of region demo, which is held out"):
             gather(text, tmp_path)
-    with pytest.raises(SettingsError, match="names no ground to train on"):
-        gather(TINY.replace("seeds = [901]", 'seeds = [1]\nsplit = "test"'), tmp_path)
 
 
 def test_terms_of_training_tiles_are_those_of_their_regions(tmp_path: Path) -> None:
@@ -240,15 +238,15 @@ def test_terms_of_training_tiles_are_those_of_their_regions(tmp_path: Path) -> N
     for name in ("town-a", "town-b", "kampala"):
         shutil.copy(ROOT / "data" / "regions" / f"{name}.toml", tmp_path / "regions")
     real = network.SourceSpec(name="mine", kind="tiles", regions=("kampala",))
-    (told,) = [network.with_terms(real, tmp_path).model_dump()]
+    (told,) = [network.with_terms(real, tmp_path, {}).model_dump()]
     assert network.licence_of([told]) == (
         "Apache-2.0 for the weights; trained on mine: (c) OpenStreetMap contributors, ODbL 1.0; "
         "OpenAerialMap contributors, CC BY 4.0 (CC BY 4.0)"
     )
     own = network.SourceSpec(name="own", kind="tiles", regions=("town-a", "town-b"))
-    assert network.with_terms(own, tmp_path).licence == "Apache-2.0, as brmgeo"
+    assert network.with_terms(own, tmp_path, {}).licence == "Apache-2.0, as brmgeo"
     said = own.model_copy(update={"licence": "mine", "attribution": "me"})
-    assert network.with_terms(said, tmp_path) == said
+    assert network.with_terms(said, tmp_path, {}) == said
     # What nobody states is not taken for free.
     pairs = {"name": "far", "kind": "pairs", "split": "train"}
     assert network.licence_of([pairs]).endswith("trained on far: terms not stated")
@@ -382,9 +380,44 @@ def test_sources_that_are_wrong_are_refused(tmp_path: Path) -> None:
         gather(TINY.replace('name = "far"', 'name = "held"'), tmp_path)
     with pytest.raises(SettingsError, match="names no seeds"):
         gather(TINY.replace("seeds = [903]", ""), tmp_path)
-    for regions in ("[]", '["a", "a"]'):
-        with pytest.raises(SettingsError, match=r"names no regions|named twice"):
-            gather(TINY + f'[[source]]\nname = "own"\nkind = "tiles"\nregions = {regions}\n', tmp_path)
+    tiles = TINY + '[[source]]\nname = "own"\nkind = "tiles"\nregions = {}\n'
+    with pytest.raises(SettingsError, match="named twice"):
+        gather(tiles.format('["a", "a"]'), tmp_path)
+    with pytest.raises(MissingInputError, match="--source own=PATH"):
+        gather(tiles.format("[]"), tmp_path)
+
+
+def test_tiles_in_a_folder_are_a_source(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    for part in ("images", "masks"):
+        (tmp_path / part).mkdir()
+    for k in range(3):
+        label = np.zeros((80, 90), np.uint8)
+        label[20:40, 10 : 40 + 10 * k] = 255
+        picture = rng.integers(0, 255, (80, 90, 3)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), picture)
+        cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), label)
+    pairs = (tmp_path / "images", tmp_path / "masks")
+    for split in ("train", "test"):
+        training.cut_pairs(
+            *pairs, tmp_path / split, 0.25, split, split, "Those who flew", "CC BY 4.0", "serial"
+        )
+    source = '[[source]]\nkind = "tiles"\nname = "{0}"\nsplit = "{0}"\n'
+    own = TINY[: TINY.index("[[source]]")] + "".join(
+        source.format(s) for s in ("train", "validation", "test")
+    )
+    paths = dict.fromkeys(("train", "validation", "test"), tmp_path / "train")
+    ground = gather(own, tmp_path, **paths)
+    image, label, gsd_m, _ = ground.train.patch(np.random.default_rng(1), 10.0, 1.0)
+    assert (image.shape, label.shape, gsd_m) == ((80, 90, 3), (80, 90), 0.25)
+    assert set(np.unique(label)) == {0, 255}
+    assert len(ground.validation["validation"]) == len(ground.test["test"]) == 3
+    credit = ground.credits[0]
+    assert (credit["attribution"], credit["licence"]) == ("Those who flew", "CC BY 4.0")
+    with pytest.raises(SettingsError, match="are of a held-out region"):
+        gather(own, tmp_path, **paths | {"train": tmp_path / "test"})
+    with pytest.raises(MissingInputError, match="holds no training tiles"):
+        gather(own, tmp_path, **paths | {"train": tmp_path / "images"})
 
 
 def test_a_region_that_is_held_out_is_never_trained_on(tmp_path: Path) -> None:
@@ -406,6 +439,9 @@ def test_tiles_are_cut_for_what_they_are_wanted_for(monkeypatch: pytest.MonkeyPa
                 TileInfo(str(k), 0, 0.25, s, "a", 0.1, 1.0, (0, 0, 1, 1), "") for k, s in enumerate(splits)
             ]
 
+        def __len__(self) -> int:
+            return len(self.infos)
+
         def of_split(self, split: str) -> list[int]:
             return [i for i, info in enumerate(self.infos) if info.split == split]
 
@@ -421,11 +457,12 @@ def test_tiles_are_cut_for_what_they_are_wanted_for(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(training, "cut_region", cut_region)
     monkeypatch.setattr(training, "last_aligned", lambda *args: False)
+    monkeypatch.setattr(network, "with_terms", lambda spec, *_: spec)
     monkeypatch.setattr(training, "require_all_trainable", lambda *args: [])
     monkeypatch.setattr(network, "read_tiles", lambda tiles: tiles)
     found = {
         split: [part for part, *_ in network._tile_sources(
-            network.SourceSpec(name="t", kind="tiles", split=split, regions=("a",)), tmp_path, 0.3
+            network.SourceSpec(name="t", kind="tiles", split=split, regions=("a",)), tmp_path, {}, 0.3
         )]
         for split in ("train", "validation", "test")
     }  # fmt: skip
