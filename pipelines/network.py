@@ -8,8 +8,8 @@ of one of these kinds:
   without ``regions``, those in a folder, such as ``brmgeo tiles --pairs`` makes;
 - ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
 - ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
-- ``flight``: a flight folder whose frames have masks; for tests only. Masks of outlines on the ground are scored as they are
-  and, where ``roof_m`` says how high roofs stand, once more moved to where a camera sees roofs of that height.
+- ``flight``: a flight folder whose frames have masks; for tests only. Where ``roof_m`` says how high roofs stand, the
+  network's answers are scored once more after they were laid onto the ground as ``localize`` lays them.
 
 Folders that are not part of the project are given with ``--source NAME=PATH``.
 """
@@ -40,7 +40,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.flight.camera import world_from_camera
 from brmgeo.flight.folder import read_flight
-from brmgeo.flight.view import raised
+from brmgeo.flight.view import lowered
 from brmgeo.geo.grid import lattice
 from brmgeo.maps.rasterize import building_mask
 from brmgeo.region import describe_fault, load_region
@@ -78,8 +78,8 @@ class SourceSpec(_Spec):
 
     ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation.
     ``tiles`` that are for training take their regions' own train and validation splits; a region is in one source
-    only. ``weight``: how often the source is drawn in training. ``roof_m``: of a flight, the height of the roofs that its
-    outlines are also scored at; 0: only as they are.
+    only. ``weight``: how often the source is drawn in training. ``roof_m``: of a flight whose masks are outlines on the
+    ground, the height of the roofs that answers are also laid down from; 0: they are scored as they are alone.
     """
 
     name: str
@@ -304,11 +304,11 @@ def _assembled(
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One frame to be scored: how to read its (image, label), its GSD, and how its label is raised to ``roof_m``."""
+    """One frame to be scored: how to read its (image, label), its GSD, and how roofs of ``roof_m`` are laid down in it."""
 
     read: Callable[[], tuple[U8, U8]]
     gsd_m: float
-    raised: Callable[[U8], U8] | None = None
+    lowered: Callable[[F32], F32] | None = None
     roof_m: float = 0.0
 
 
@@ -569,7 +569,7 @@ def _frames_of(scene: Scene, gsd_m: float) -> list[Picture]:
 
 
 def _flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
-    """The frames of a flight with its masks, which can be raised to roofs of a height above 0.
+    """The frames of a flight with its masks, onto which roofs of a height above 0 can be laid.
 
     Raises MissingInputError without frames or masks, SettingsError where the roofs reach a camera.
     """
@@ -589,13 +589,13 @@ def _flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
 
         return read
 
-    def raiser(i: int) -> Callable[[U8], U8]:
+    def layer(i: int) -> Callable[[F32], F32]:
         frame = flight.frames[i]
         tilt = world_from_camera(flight.mount, frame.roll_rad, frame.pitch_rad, 0.0)
-        return lambda label: raised(label, flight.camera, tilt, frame.agl_m, roof_m, UNKNOWN)
+        return lambda answer: lowered(answer, flight.camera, tilt, frame.agl_m, roof_m)
 
     return [
-        Picture(reader(i), frame_gsd_m(flight, i), raiser(i) if roof_m else None, roof_m)
+        Picture(reader(i), frame_gsd_m(flight, i), layer(i) if roof_m else None, roof_m)
         for i in range(len(flight.frames))
     ]
 
@@ -914,18 +914,21 @@ def _weighed(parts: Sequence[LogitHistogram]) -> LogitHistogram:
 def score(segmenter: Any, pictures: Sequence[Picture]) -> dict[str, Scores]:
     """The scores of frames by a ``brmgeo.segment.predict.Segmenter``, at the frames' own GSD.
 
-    Under "" those of the labels as they are; where labels can be raised, under ", outlines at H m" those of raised ones.
+    Under "" those of the answers as they are; where these can be laid onto the ground, under ", laid down from H m" those
+    of what lies there, over the pixels whose roofs are within the frame.
     """
     total = {"": Scores()}
     for picture in pictures:
         image, label = picture.read()
         probability = segmenter.probability(image, picture.gsd_m)
-        labels = {"": label}
-        if picture.raised:
-            labels[f", outlines at {picture.roof_m:g} m"] = picture.raised(label)
-        for height, own in labels.items():
-            found = segmentation_scores(probability, own, segmenter.card.threshold, picture.gsd_m)
-            total[height] = total.get(height, Scores()) + found
+        answers = {"": (probability, label)}
+        if picture.lowered:
+            laid = picture.lowered(probability)
+            own = np.where(np.isnan(laid), np.uint8(UNKNOWN), label)
+            answers[f", laid down from {picture.roof_m:g} m"] = laid, own
+        for how, (seen, truth) in answers.items():
+            found = segmentation_scores(seen, truth, segmenter.card.threshold, picture.gsd_m)
+            total[how] = total.get(how, Scores()) + found
     return total
 
 

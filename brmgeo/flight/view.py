@@ -27,7 +27,7 @@ from brmgeo.flight.readings import Attitude, Camera, FloatArray
 from brmgeo.flight.values import View
 
 MAX_SAMPLES = 8
-_ROWS = 256  # of a frame that are raised at a time
+_ROWS = 256  # of a frame that are moved at a time
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -207,31 +207,33 @@ def make_view(
     )
 
 
-def raised(
-    mask: NDArray[np.uint8], camera: Camera, rotation: FloatArray, agl_m: float, height_m: float, outside: int
-) -> NDArray[np.uint8]:
-    """(h, w) uint8 mask of what lies on the ground, as if it stood ``height_m`` above: where a camera sees the roofs.
+def lowered(
+    image: NDArray[np.float32], camera: Camera, rotation: FloatArray, agl_m: float, height_m: float
+) -> NDArray[np.float32]:
+    """(h, w) float32 of what stands ``height_m`` above the ground, moved to where its outline on the ground would be seen.
 
     Args:
+        image: (h, w) float32, such as a probability of roofs.
         rotation: (3, 3) world_from_camera, z upwards; any heading.
         agl_m: height of the camera above ground.
         height_m: of what stands, below the camera.
-        outside: what pixels get whose ground lies beyond the frame.
+
+    NaN where that lies beyond the frame, or the ground beyond the horizon.
     """
-    h, w = mask.shape
+    h, w = image.shape
     at = np.array([0.0, 0.0, agl_m])
-    out = np.empty_like(mask)
+    out = np.empty_like(image)
     for top in range(0, h, _ROWS):
         v, u = np.mgrid[top : min(top + _ROWS, h), :w].astype(np.float64)
-        xy = ground_from_pixel(camera, rotation, at, np.dstack([u, v]), height_m)
-        source = pixel_from_point(camera, rotation, at, np.dstack([xy, np.zeros(u.shape)]))
+        xy = ground_from_pixel(camera, rotation, at, np.dstack([u, v]))
+        source = pixel_from_point(camera, rotation, at, np.dstack([xy, np.full(u.shape, height_m)]))
         out[top : top + _ROWS] = cv2.remap(
-            mask,
+            image,
             np.nan_to_num(source, nan=-10.0).astype(np.float32),
             None,
-            cv2.INTER_NEAREST,
+            cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
-            borderValue=outside,
+            borderValue=math.nan,
         )
     return out
 

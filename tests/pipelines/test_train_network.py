@@ -19,7 +19,7 @@ from safetensors.numpy import load_file
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.flight.camera import pixel_from_point, world_from_camera
 from brmgeo.flight.readings import Attitude, Camera
-from brmgeo.flight.view import raised
+from brmgeo.flight.view import lowered
 from brmgeo.region import load_region
 from brmgeo.segment.augment import AugmentSettings
 from brmgeo.segment.metrics import LogitHistogram
@@ -139,7 +139,7 @@ def test_pairs_cut_short_transparent_or_of_other_sizes(tmp_path: Path) -> None:
         network.read_pairs(tmp_path)
 
 
-def test_outlines_are_moved_to_where_a_camera_sees_roofs() -> None:
+def test_roofs_are_laid_onto_their_outlines_on_the_ground() -> None:
     camera = Camera(400, 300, 300.0, 300.0, 199.5, 149.5)
     # 20 degrees forward: pixels of one row see the same distance ahead.
     tilt = world_from_camera(Attitude(0.0, math.radians(-20.0), 0.0), 0.0, 0.0, 0.0)
@@ -153,36 +153,38 @@ def test_outlines_are_moved_to_where_a_camera_sees_roofs() -> None:
         cv2.fillPoly(label, [np.rint(uv * 256).astype(np.int32)], 255, shift=8)
         return label
 
-    moved = raised(drawn(0.0), camera, tilt, agl, roof, 127)
-    want = drawn(roof)
-    known = moved != 127
+    moved = lowered(drawn(roof).astype(np.float32), camera, tilt, agl, roof)
+    want = drawn(0.0)
+    known = np.isfinite(moved)
     assert known.mean() > 0.8
-    both, either = ((moved == 255) & (want == 255)).sum(), ((moved == 255) | ((want == 255) & known)).sum()
+    both, either = ((moved > 127) & (want == 255)).sum(), ((moved > 127) | ((want == 255) & known)).sum()
     assert both / either > 0.97
-    assert ((drawn(0.0) == 255) & (want == 255)).sum() / (want == 255).sum() < 0.9
+    roofs = drawn(roof)
+    assert ((roofs == 255) & (want == 255)).sum() / ((roofs == 255) | (want == 255)).sum() < 0.9
     # Tilted to the horizon: sky is unknown, and nothing else breaks.
     sky = world_from_camera(Attitude(0.0, math.radians(-85.0), 0.0), 0.0, 0.0, 0.0)
-    over = raised(np.full((300, 400), 255, np.uint8), camera, sky, agl, roof, 127)
-    assert {*np.unique(over)} == {127, 255}
+    over = lowered(np.ones((300, 400), np.float32), camera, sky, agl, roof)
+    assert np.isnan(over[0]).all()
+    assert set(over[np.isfinite(over)]) == {1.0}
 
 
 @pytest.mark.skipif(
     not (REAL / "flight-sheffield").exists(), reason="real flight not here: set BRMGEO_REAL_DATA"
 )
-def test_a_real_flights_outlines_are_raised_away_from_the_camera() -> None:
+def test_roofs_of_a_real_flight_are_laid_towards_the_camera() -> None:
     pictures = network._flight_frames(REAL / "flight-sheffield", 3.0)
     moved = []
     for picture in pictures[::10]:
         label = picture.read()[1]
-        assert picture.raised is not None
-        up = picture.raised(label)
-        both = (label != 127) & (up != 127)
-        if (label[both] == 255).mean() > 0.05:
-            rows = [np.flatnonzero(((m == 255) & both).any(1)).mean() for m in (label, up)]
+        assert picture.lowered is not None
+        laid = picture.lowered((label == 255).astype(np.float32))
+        known = (label != 127) & np.isfinite(laid)
+        if (label[known] == 255).mean() > 0.05:
+            rows = [np.flatnonzero((m & known).any(1)).mean() for m in (label == 255, laid > 0.5)]
             moved.append(rows[1] - rows[0])
-    # The camera looks 16 degrees forward: the most of a frame lies ahead, where what stands is seen further up.
+    # The camera looks 16 degrees forward: the most of a frame lies ahead, where the ground is seen below what stands on it.
     assert len(moved) >= 3
-    assert np.median(moved) < -1
+    assert np.median(moved) > 1
     with pytest.raises(SettingsError, match="too low for roof_m 40"):
         network._flight_frames(REAL / "flight-sheffield", 40.0)
 
