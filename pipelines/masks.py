@@ -670,6 +670,8 @@ def _rgb_bands(src: Any, path: Path, bands: tuple[int, ...] | None) -> tuple[int
     named = {kind: band for band, kind in reversed(list(enumerate(src.colorinterp, start=1)))}
     if all(kind in named for kind in (kinds.red, kinds.green, kinds.blue)):
         return named[kinds.red], named[kinds.green], named[kinds.blue]
+    if src.count == 2 and kinds.alpha not in named:
+        raise SettingsError(f"{path} has two bands: say which are red, green and blue, or grey (--bands 1)")
     return (1, 2, 3) if src.count >= 3 else (1,)
 
 

@@ -376,6 +376,10 @@ def _colour_bands(src: Any, source: GeoRaster | NgiiOrtho) -> list[int]:
             bands = named
         elif len(colours) >= 3:
             bands = colours[:3]
+        elif len(colours) == 2:
+            raise InputError(
+                f"{source.path} has two bands: state which are red, green and blue, or grey (bands = [1])"
+            )
         else:
             bands = colours[:1] or [1]
     low_high = source.value_range

@@ -328,6 +328,10 @@ def test_refusals(tmp_path: Path) -> None:
         mosaic_to_lattice(GeoRaster(good, crs="EPSG:5181"), BOX)
     with pytest.raises(InputError, match="bands 1 to 3"):
         mosaic_to_lattice(GeoRaster(good, bands=(1, 2, 7)), BOX)
+    two = write_tiff(tmp_path / "two.tif", image[:2], Affine(0.5, 0, 175000, 0, -0.5, 563200), EAST)
+    with pytest.raises(InputError, match=r"two\.tif has two bands: state"):
+        mosaic_to_lattice(GeoRaster(two), BOX)
+    assert mosaic_to_lattice(GeoRaster(two, bands=(2,)), BOX)[1].any()
     check_imagery([GeoRaster(good)], BOX)
     far = lattice((175000.0, 563000.0, 175150.0, 563110.0), "EPSG:5186", 0.5)
     with pytest.raises(CrsError, match=r"good\.tif in EPSG:5187, is 17\d\.\d km away"):

@@ -545,6 +545,7 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
     write_raster(tmp_path / "coarse.tif", image, gsd=30.0)
     write_raster(tmp_path / "deep.tif", image.astype(np.uint16))
     write_raster(tmp_path / "tiny.tif", image[:8])
+    write_raster(tmp_path / "two.tif", image[:, :, :2])
     cut = tmp_path / "cut.tif"
     cut.write_bytes(whole.read_bytes()[:5000])
     # Blocks beyond the end of the file: it opens, and fails where it is read.
@@ -562,6 +563,7 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
         "coarse.tif": ((), "too coarse"),
         "deep.tif": ((), "--levels LOW,HIGH"),
         "tiny.tif": ((), "at least 16 px"),
+        "two.tif": ((), "has two bands: say which"),
         "cut.tif": ((), "cut.tif"),
         "large.tif": ((), "large.tif: damaged or cut short"),
         "frame.jpg": ((), "such as a frame: give the folder that holds it"),
