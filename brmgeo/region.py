@@ -195,6 +195,10 @@ class TrainingSettings(_Settings):
     def _sound(self) -> TrainingSettings:
         if not self.gsd_m or len(set(self.gsd_m)) != len(self.gsd_m):
             raise ValueError("'gsd_m' names no GSD, or one twice")
+        if len({round(gsd * 1000) for gsd in self.gsd_m}) != len(self.gsd_m):
+            raise ValueError(
+                f"two of 'gsd_m' {list(self.gsd_m)} are the same to the millimetre: leave one out"
+            )
         if self.overlap_px >= self.tile_px:
             raise ValueError("'overlap_px' must be smaller than 'tile_px'")
         if self.validation_share + self.test_share > 1:

@@ -192,6 +192,11 @@ def maps(
 @click.option("--name", help="With --pairs: what to call them (default: pairs).")
 @click.option("--attribution", help="With --pairs: whose pictures they are; it goes into tiles.json.")
 @click.option("--terms", default="", help="With --pairs: under which terms they may be used.")
+@click.option(
+    "--empty-share",
+    type=float,
+    help="With --pairs: at most this share of the tiles has no building (0.2 by default; 1 keeps all).",
+)
 def tiles(
     regions: tuple[str, ...],
     data: Path,
@@ -204,6 +209,7 @@ def tiles(
     name: str | None,
     attribution: str | None,
     terms: str,
+    empty_share: float | None,
 ) -> None:
     """Cut training tiles (image + label pairs) of REGIONS, or make them of foreign --pairs."""
     from pipelines import training as job
@@ -221,7 +227,8 @@ def tiles(
             raise SettingsError(
                 "tiles --pairs: pairs have no place to make blocks of; give train, validation or test"
             )
-        job.cut_pairs(*pairs, out, gsd_m[0], name or "pairs", split or "train", attribution, terms, scheduler)
+        what = (name or "pairs", split or "train", attribution, terms)
+        job.cut_pairs(*pairs, out, gsd_m[0], *what, scheduler, empty_share)
         return
     if not regions:
         raise SettingsError(
@@ -229,7 +236,13 @@ def tiles(
         )
     if out is not None and len(regions) > 1:
         raise SettingsError("tiles: --out takes one REGION; without it each goes to data/out/REGION/tiles")
-    for option, value in {"--name": name, "--attribution": attribution, "--terms": terms or None}.items():
+    given = {
+        "--name": name,
+        "--attribution": attribution,
+        "--terms": terms or None,
+        "--empty-share": empty_share,
+    }
+    for option, value in given.items():
         if value is not None:
             raise SettingsError(f"tiles: {option} goes with --pairs; a region's own is in its TOML file")
     job.require_all_trainable(regions, data, split)

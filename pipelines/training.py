@@ -2,7 +2,7 @@
 
 The stages go on from those of the maps (``source``, ``outlines``, ``lattice``, ``footprints``): ``alignment`` (how far the
 labels lie beside the imagery), ``tile-survey`` (every tile that could be cut, its split, and why it is left out), ``tiles``
-(one step a shard), ``tile-index``.
+(one step a shard), ``tile-index``. Foreign pairs have ``pair-survey``, ``tile-pairs`` (one step a shard), ``tile-index``.
 """
 
 from __future__ import annotations
@@ -10,8 +10,11 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,11 +25,11 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import CrsError, InputError, MissingInputError, SettingsError
 from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
 from brmgeo.region import Region, TrainingSettings, load_region
-from brmgeo.segment import SPLITS, UNKNOWN
+from brmgeo.segment import OTHER, SPLITS, UNKNOWN
 from brmgeo.segment.predict import require_whole
 from brmgeo.segment.samples import blank_unknown
 from brmgeo.segment.shards import (
@@ -65,9 +68,15 @@ COARSE = 8  # the survey looks at imagery in pixels this many times larger
 FINEST = 1.3  # tiles may be this many times finer than their imagery, no more: upsampled pictures teach blur
 SURVEY_TILES = 64
 PAIRS_A_SHARD = 512
+PUBLISHED = ".brmgeo-published.json"  # the store's own record of what it put into a folder of results
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192
 ARROW = 20.0
+LEFT_OUT = {
+    "empty": "without building",
+    "guard": "in the guard band",
+    "held-out ground": "on held-out ground",
+}
 # Blocks in which offsets are measured, how far they are looked for, and in what pixels: finer ones tell no more of outlines
 # that are drawn to a decimetre or worse.
 ALIGN = {"block_m": 250.0, "least_block_m": 100.0, "search_m": 10.0, "gsd_m": 0.25}
@@ -159,7 +168,7 @@ def label_offset(folder: Path, bounds: Bounds) -> tuple[float, float]:
 
 def run_survey(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     """Writes survey.json: all candidates with their split and shares, and why those that are not kept are left out."""
-    from brmgeo.ingest.imagery import native_gsd_m
+    from brmgeo.ingest.imagery import check_imagery, native_gsd_m
 
     box, _ = read_lattice(inputs["lattice"])
     native = native_gsd_m(_sources(inputs, settings), box)
@@ -180,26 +189,57 @@ def run_survey(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
     work = functools.partial(_survey_some, dict(inputs), json.dumps(settings))
     found = [tile for some in map(work, todo) for tile in some]
     ground = _ground_of(found)
-    for g in gsds:
-        for split in SPLITS:
-            own = [t for t in found if t["gsd_m"] == g and t["split"] == split and not t["dropped"]]
-            empty = [t["key"] for t in own if t["built"] == 0]
-            kept = sample_empty(len(own) - len(empty), empty, settings["empty_share"], settings["seed"])
-            for tile in own:
-                if tile["built"] == 0 and tile["key"] not in kept:
-                    tile["dropped"] = "empty"
-    dropped = Counter(t["dropped"] or "kept" for t in found)
-    facts = {
-        "candidates": len(found),
-        "kept": dropped.pop("kept", 0),
-        "dropped": dict(sorted(dropped.items())),
+    facts = _sampled(found, settings) | {
         "imagery_gsd_m": round(native, 4),
         "gsd_m": gsds,
         "gsd_too_fine_m": fine,
         "ground": ground,
     }
+    if not facts["kept"]:
+        if "unknown" in facts["dropped"]:
+            check_imagery(_sources(inputs, settings), box)
+        place = ", ".join(f"{v:.0f}" for v in settings["bounds"])
+        hints = {
+            "unknown": f"see that map and imagery both reach the region's bounds, {place} in {box.crs}",
+            "blank": "see that the imagery is not of one colour there",
+            "cloudy": "give clearer imagery, or a larger training.max_cloud_share",
+            "empty": "training.empty_share = 1 keeps them",
+            "guard": "give a larger training.block_m or a smaller training.guard_m",
+            "held-out ground": f"that of {maps.listed([name for name, _ in settings['held']])}: give other bounds",
+        }
+        raise InputError(none_left(settings["region"], facts["dropped"], hints))
     (out / "survey.json").write_text(json.dumps({"facts": facts, "tiles": found}), encoding="utf-8")
     return facts
+
+
+def _sampled(found: Sequence[Json], settings: Json) -> dict[str, Any]:
+    """Marks the tiles without buildings that are too many of a GSD and split; what then is kept and left out."""
+    for g, split in sorted({(t["gsd_m"], t["split"]) for t in found if not t["dropped"]}):
+        own = [t for t in found if t["gsd_m"] == g and t["split"] == split and not t["dropped"]]
+        empty = [t["key"] for t in own if t["built"] == 0]
+        kept = sample_empty(len(own) - len(empty), empty, settings["empty_share"], settings["seed"])
+        for tile in own:
+            if tile["built"] == 0 and tile["key"] not in kept:
+                tile["dropped"] = "empty"
+    dropped = Counter(t["dropped"] or "kept" for t in found)
+    return {
+        "candidates": len(found),
+        "kept": dropped.pop("kept", 0),
+        "dropped": dict(sorted(dropped.items())),
+    }
+
+
+def none_left(region: str, dropped: Mapping[str, int], hints: Mapping[str, str]) -> str:
+    """The line for tiles that were all left out: how many for what reason, and the hint for the commonest."""
+    most = max(dropped, key=lambda reason: dropped[reason], default="")
+    hint = hints.get(most, "check the map, the imagery and [training]")
+    return f"{region}: no tile is left: {told_dropped(dropped) or 'none was cut'}; {hint}"
+
+
+def told_dropped(dropped: Mapping[str, int]) -> str:
+    """Such as "12 unknown, 3 without building", the commonest reason first."""
+    common = sorted(dropped.items(), key=lambda item: -item[1])
+    return ", ".join(f"{count} {LEFT_OUT.get(reason, reason)}" for reason, count in common)
 
 
 def _ground_of(found: Sequence[Json]) -> Json:
@@ -385,15 +425,10 @@ def run_index(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
                 "tiles": len(text["rows"]),
             }
         )
+    facts = json.loads((inputs["survey"] / "survey.json").read_text(encoding="utf-8"))["facts"]
     if not rows:
-        raise InputError(
-            f"{settings['region']}: no tile is left: {json.dumps(settings['facts'].get('dropped', {}))} were left out; "
-            "check the map, the imagery and [training]"
-        )
+        raise InputError(none_left(settings["region"], facts["dropped"], {}))
     write_index(out / INDEX_CSV, rows)
-    facts = dict(settings["facts"])
-    if "survey" in inputs:
-        facts |= json.loads((inputs["survey"] / "survey.json").read_text(encoding="utf-8"))["facts"]
     offsets = None
     if "alignment" in inputs:
         offsets = json.loads((inputs["alignment"] / "alignment.json").read_text(encoding="utf-8"))
@@ -567,7 +602,6 @@ def plan_tiles(
             "tile_px": own.tile_px,
             "overlap_px": own.overlap_px,
             "shards": list(names.values()),
-            "facts": {},
             "align": align,
             "blocks": {
                 "guard_m": blocks.guard_m,
@@ -600,7 +634,7 @@ def flights_over(name: str, data: Path) -> list[str]:
 
 
 def require_trainable(region: Region, data: Path) -> None:
-    """Raises SettingsError (one line) for a region that must not be trained on: held out, or flown over."""
+    """Raises SettingsError (one line) for a region that must not be trained on: held out, flown over, or a copy of such."""
     if region.training.hold_out:
         raise SettingsError(
             f"region {region.name} is held out (training.hold_out = true in its region file), so it is never trained on: "
@@ -612,6 +646,12 @@ def require_trainable(region: Region, data: Path) -> None:
             f"region {region.name} is flown over by {maps.listed(flown)}, so it is never trained on: set training.hold_out "
             "= true in its region file to cut it for testing, or train on other regions"
         )
+    for other in _tested_regions(region, data):
+        if _same_town(region, other):
+            raise SettingsError(
+                f"region {region.name} is the same generated town as {other.name}, which is held out or flown over, so it "
+                "is never trained on: give it another [generate] seed"
+            )
 
 
 def require_all_trainable(names: Sequence[str], data: Path, split: str | None) -> list[tuple[Region, Path]]:
@@ -638,6 +678,18 @@ def held_ground(region: Region, data: Path) -> list[tuple[str, Bounds]]:
     if region.generate is not None or region.training.hold_out or region.training.split == "test":
         return found
     own = shapely.box(*maps.place_of(region))
+    for other in _tested_regions(region, data):
+        place = _place_in(region.crs, other) if other.generate is None else None
+        if place is None:
+            continue
+        grown = place.buffer(region.training.guard_m, join_style="mitre")
+        if grown.intersects(own):
+            found.append((other.name, maps.as_bounds(grown.bounds)))
+    return found
+
+
+def _tested_regions(region: Region, data: Path) -> Iterator[Region]:
+    """The other regions that are held out, for testing only, or flown over."""
     for path in sorted((data / "regions").glob("*.toml")):
         if path.stem.startswith("_") or path.stem == region.name:
             continue
@@ -645,15 +697,25 @@ def held_ground(region: Region, data: Path) -> list[tuple[str, Bounds]]:
             other = load_region(path)
         except SettingsError:
             continue  # whoever uses that region is told
-        if other.generate is not None or not (
-            other.training.hold_out or other.training.split == "test" or flights_over(other.name, data)
-        ):
-            continue
-        place = transform_bounds(other.crs, region.crs, maps.place_of(other))
-        grown = shapely.box(*place).buffer(region.training.guard_m, join_style="mitre")
-        if grown.intersects(own):
-            found.append((other.name, maps.as_bounds(grown.bounds)))
-    return found
+        if other.training.hold_out or other.training.split == "test" or flights_over(other.name, data):
+            yield other
+
+
+def _same_town(region: Region, other: Region) -> bool:
+    """Whether two generated regions show one town; its outlines are the same in every season."""
+    a, b = region.generate, other.generate
+    if a is None or b is None or (a.seed, a.style) != (b.seed, b.style):
+        return False
+    place = _place_in(region.crs, other)
+    return place is not None and bool(place.intersects(shapely.box(*maps.place_of(region))))
+
+
+def _place_in(crs: str, other: Region) -> Any:
+    """The ground of a region in another CRS; None where it has no place there, far away as it is."""
+    try:
+        return shapely.box(*transform_bounds(other.crs, crs, maps.place_of(other)))
+    except CrsError:
+        return None
 
 
 # --- the jobs that the command line calls ---------------------------------------------------------------------------
@@ -697,9 +759,8 @@ def _changed(settings: TrainingSettings, changes: Mapping[str, Any]) -> Training
 def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None, align: bool = False) -> Path:
     """Builds what is missing of a region's training tiles and publishes them in ``out``."""
     progress = Progress()
-    maps.require_writable(out)
     store = Store(data / "work")
-    with store.lock(region.name):
+    with _folder(out, region.name), store.lock(region.name):
         plan, names = plan_tiles(region, store, data, fetch=True, align=align)
         with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
             made = plan.build(map, progress)
@@ -731,19 +792,60 @@ def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None,
     return out
 
 
+@contextmanager
+def _folder(out: Path, region: str) -> Iterator[None]:
+    """Makes the folder of a region's tiles; where the work fails, empty folders that this made are gone again.
+
+    Raises SettingsError where it holds the tiles of something else, WorkflowError where it cannot be written.
+    """
+    facts = _read_dict(out / TILES_JSON)
+    there = f"tiles of {facts.get('region')}" if facts.get("format") == FORMAT else "another tiles.json"
+    if facts and there != f"tiles of {region}":
+        raise SettingsError(
+            f"{out}: holds {there}, which those of {region} would replace in part: give another --out, or move them away"
+        )
+    new = [p for p in (out, *out.parents) if not os.path.exists(p)]
+    try:
+        maps.require_writable(out)
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for folder in new:
+                folder.rmdir()
+        raise
+
+
+def _read_dict(path: Path) -> dict[str, Any]:
+    """A JSON object; empty for a file that is not there or holds none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _published_before(out: Path, region: str) -> set[str]:
+    """Files of tiles in ``out`` that an earlier run put there, and no file of the user's."""
+    shards = _read_dict(out / TILES_JSON).get("shards")
+    names = {str(s.get("file")) for s in shards or [] if isinstance(s, dict)}
+    names |= _read_dict(out / PUBLISHED).keys()
+    shard = re.compile(rf"{re.escape(region)}-(\d{{4,}}-)?\d{{3,}}\.tar", re.ASCII)
+    return {name for name in names if shard.fullmatch(name) or name in ("alignment.json", "index.gpkg")}
+
+
 def _publish(made: Mapping[str, Artifact], names: Mapping[str, str], out: Path) -> None:
-    wanted = set()
+    index = made["tile-index"]
+    before, wanted = _published_before(out, index.step.settings["region"]), set(index.record["outputs"])
     for label, name in names.items():
         if (made[label].path / "shard.tar").exists():
             publish(made[label], out, {"shard.tar": f"{name}.tar"})
             wanted.add(f"{name}.tar")
-    index = made["tile-index"]
     publish(index, out, sorted(index.record["outputs"]))
     if "alignment" in made:
         publish(made["alignment"], out, ["alignment.json"])
-    for stale in out.glob(f"{index.step.settings['region']}-*.tar"):
-        if stale.name not in wanted:
-            stale.unlink()  # of an earlier cut with other settings
+        wanted.add("alignment.json")
+    for stale in before - wanted:
+        (out / stale).unlink(missing_ok=True)  # of an earlier cut with other settings
 
 
 def status_lines(name: str, data: Path, verify: bool = False) -> list[str]:
@@ -783,34 +885,87 @@ def _plan_as_last_cut(name: str, data: Path) -> Plan | None:
 # --- pairs: images and masks of others ------------------------------------------------------------------------------
 
 
+def run_pair_survey(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
+    """Writes survey.json: all image + mask pairs with their shares, and why those that are not kept are left out."""
+    pairs = settings["pairs"]
+    todo = [pairs[first : first + SURVEY_TILES] for first in range(0, len(pairs), SURVEY_TILES)]
+    work = functools.partial(_survey_pairs, dict(inputs), json.dumps(settings | {"pairs": None}))
+    found = [tile for some in map(work, todo) for tile in some]
+    ground = _ground_of(found)
+    facts = _sampled(found, settings) | {"ground": ground}
+    if not facts["kept"]:
+        hints = {
+            "unknown": "masks hold 0, 255 and, for unknown, 127; see that pictures are not transparent or plain filler",
+            "blank": "give pictures of more than one colour",
+            "cloudy": "give pictures of a clearer day",
+            "empty": "--empty-share 1 keeps them",
+        }
+        raise InputError(none_left(settings["region"], facts["dropped"], hints))
+    (out / "survey.json").write_text(json.dumps({"facts": facts, "tiles": found}), encoding="utf-8")
+    return facts
+
+
+def _survey_pairs(inputs: Inputs, text: str, pairs: Sequence[Sequence[str]]) -> list[Json]:
+    settings = json.loads(text)
+    found: list[Json] = []
+    for key, image_name, mask_name in pairs:
+        image, label = read_pair(inputs["images"] / image_name, inputs["masks"] / mask_name)
+        built, known = shares(label)
+        fault = "unknown" if known == 0 else _pair_fault(image, label, settings["max_cloud_share"])
+        found.append(
+            {
+                "key": key,
+                "gsd_m": settings["gsd_m"],
+                "split": settings["split"],
+                "built": round(built, 6),
+                "known": round(known, 6),
+                "dropped": fault,
+            }
+        )
+    return found
+
+
+def _pair_fault(image: NDArray[np.uint8], label: NDArray[np.uint8], cloud_share: float) -> str | None:
+    """Blank as it is, cloudy as the survey of a region sees it: in pixels COARSE times larger."""
+    import cv2
+
+    fault = picture_fault(image, label != UNKNOWN)
+    rows, cols = (n // COARSE for n in label.shape)
+    seen = label[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE][:rows, :cols]
+    if fault is not None or not (seen == OTHER).any():
+        return fault
+    whole = image[: rows * COARSE, : cols * COARSE]
+    small = np.asarray(cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return picture_fault(small, seen != UNKNOWN, seen == OTHER, cloud_share)
+
+
 def run_pairs(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
-    """Writes shard.tar and entries.json of some image + mask pairs, as they are."""
+    """Writes shard.tar and entries.json of those of some image + mask pairs that the survey keeps, as they are."""
     tallies = {split: Tally() for split in SPLITS}
-    dropped: Counter[str] = Counter()
-    with ShardWriter(out / "shard.tar", image_format="png") as shard:
-        for key, image_name, mask_name in settings["pairs"]:
-            image, label = read_pair(inputs["images"] / image_name, inputs["masks"] / mask_name)
-            built, known = shares(label)
-            fault = "unknown" if known == 0 else picture_fault(image, label != UNKNOWN)
-            if fault is not None:
-                dropped[fault] += 1
-                continue
-            place = (float("nan"),) * 4
-            info = TileInfo(
-                key,
-                0,
-                settings["gsd_m"],
-                settings["split"],
-                settings["region"],
-                round(built, 6),
-                round(known, 6),
-                (place[0], place[1], place[2], place[3]),
-                "",
-            )
-            shard.add(info, image, label)
-            tallies[settings["split"]].add(image, label)
-    _write_entries(out, [entry_row(entry) for entry in shard.entries], tallies)
-    return {"tiles": len(shard.entries), "dropped": dict(sorted(dropped.items()))}
+    kept = {tile["key"]: tile for tile in _surveyed(inputs["survey"])}
+    own = [pair for pair in settings["pairs"] if pair[0] in kept]
+    rows: list[Json] = []
+    if own:
+        with ShardWriter(out / "shard.tar", image_format="png") as shard:
+            for key, image_name, mask_name in own:
+                image, label = read_pair(inputs["images"] / image_name, inputs["masks"] / mask_name)
+                tile, nowhere = kept[key], float("nan")
+                info = TileInfo(
+                    key,
+                    0,
+                    settings["gsd_m"],
+                    settings["split"],
+                    settings["region"],
+                    tile["built"],
+                    tile["known"],
+                    (nowhere, nowhere, nowhere, nowhere),
+                    "",
+                )
+                shard.add(info, image, label)
+                tallies[settings["split"]].add(image, label)
+        rows = [entry_row(entry) for entry in shard.entries]
+    _write_entries(out, rows, tallies)
+    return {"tiles": len(rows)}
 
 
 def read_pair(image_path: Path, mask_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -819,7 +974,7 @@ def read_pair(image_path: Path, mask_path: Path) -> tuple[NDArray[np.uint8], NDA
     Raises InputError for files that are damaged, cut short, of more than 8 bits, of odd values or of different sizes.
     """
     image, seen = _read_image(image_path)
-    label = check_label(_read_mask(mask_path), mask_path.name)
+    label = check_label(_read_mask(mask_path), str(mask_path))
     if label.shape != seen.shape:
         raise InputError(
             f"{mask_path}: {label.shape[1]} x {label.shape[0]} px, its image {image_path.name} has "
@@ -871,7 +1026,8 @@ def _decoded(path: Path) -> NDArray[np.uint8]:
     return np.asarray(found, dtype=np.uint8)
 
 
-PAIRS = Stage("tile-pairs", 2, run_pairs)
+PAIR_SURVEY = Stage("pair-survey", 1, run_pair_survey)
+PAIRS = Stage("tile-pairs", 3, run_pairs)
 
 
 def cut_pairs(
@@ -884,35 +1040,44 @@ def cut_pairs(
     attribution: str,
     terms: str,
     scheduler_spec: str | None,
+    empty_share: float | None = None,
 ) -> Path:
     """Makes training tiles of pictures and the masks of the same names; the folder that they are in.
 
-    Raises MissingInputError for folders without pictures and pictures without a mask, InputError for damaged ones.
+    Raises MissingInputError for folders without pictures and pictures without a mask, InputError for damaged ones,
+    SettingsError for a flight's own pictures unless they are for testing.
     """
+    rules = TrainingSettings()
+    empty_share = rules.empty_share if empty_share is None else empty_share
+    if not 0 <= empty_share <= 1:
+        raise SettingsError(f"tiles --pairs: --empty-share {empty_share:g} is no share of the tiles (0 to 1)")
     if not 0.02 <= gsd_m <= 10:
         raise SettingsError(f"tiles --pairs: --gsd {gsd_m:g} is no size of a pixel in metres (0.02 to 10)")
+    for folder in (images, masks) if split != "test" else ():
+        at = folder.resolve()
+        if any((p / "flight.toml").is_file() for p in (at, *at.parents[:2])):
+            raise SettingsError(
+                f"tiles --pairs: {folder} is of a flight (flight.toml stands by it), which is for testing only: give "
+                "--split test, or other pictures"
+            )
     safe = maps.safe_name(name)
-    pairs = _paired(images, masks)
+    pairs = [(f"{safe}-{stem}", *files) for stem, *files in _paired(images, masks)]
     progress = Progress()
-    maps.require_writable(out)
-    store = Store(out / ".brmgeo")
-    with store.lock(safe):
+    inputs: dict[str, Input] = {"images": images, "masks": masks}
+    own = {"gsd_m": gsd_m, "split": split, "region": safe}
+    with _folder(out, safe), (store := Store(out / ".brmgeo")).lock(safe):
         plan = Plan(store, safe)
+        drawn = {"seed": rules.seed, "max_cloud_share": rules.max_cloud_share, "empty_share": empty_share}
+        survey = plan.add(PAIR_SURVEY, inputs, own | drawn | {"pairs": pairs})
         names: dict[str, str] = {}
-        inputs: dict[str, Input] = {"images": images, "masks": masks}
         for number, first in enumerate(range(0, len(pairs), PAIRS_A_SHARD)):
             shard = f"{safe}-{number:03d}"
-            some = [(f"{safe}-{stem}", *files) for stem, *files in pairs[first : first + PAIRS_A_SHARD]]
-            plan.add(
-                PAIRS,
-                inputs,
-                {"pairs": some, "gsd_m": gsd_m, "split": split, "region": safe},
-                f"tiles {shard}",
-            )
+            some = pairs[first : first + PAIRS_A_SHARD]
+            plan.add(PAIRS, inputs | {"survey": survey}, own | {"pairs": some}, f"tiles {shard}")
             names[f"tiles {shard}"] = shard
         plan.add(
             INDEX,
-            {shard: plan.steps[label] for label, shard in names.items()},
+            {"survey": survey} | {shard: plan.steps[label] for label, shard in names.items()},
             {
                 "region": safe,
                 "title": name,
@@ -920,7 +1085,6 @@ def cut_pairs(
                 "tile_px": None,
                 "overlap_px": 0,
                 "shards": list(names.values()),
-                "facts": {"candidates": len(pairs)},
                 "align": False,
                 "blocks": None,
                 "credit": attribution,
@@ -930,9 +1094,10 @@ def cut_pairs(
         with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
             made = plan.build(map, progress)
         _publish(made, names, out)
-    left = len(pairs) - made["tile-index"].facts["tiles"]
+    facts = made["pair-survey"].facts
+    why = f" ({told_dropped(facts['dropped'])})" if facts["dropped"] else ""
     progress.say(
-        f"{safe}: {len(pairs) - left} tiles ({split}), {left} left out as blank, cloudy or unknown; results are in {out}"
+        f"{safe}: {facts['kept']} tiles ({split}), {len(pairs) - facts['kept']} left out{why}; results are in {out}"
     )
     return out
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from small_maps import BOUNDS, CRS, SHEETS, Answer, SmallRegion, brmgeo, painted
 
+from brmgeo.errors import SettingsError
 from brmgeo.geo.grid import bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent, sheet_polygon
 from brmgeo.region import load_region
@@ -28,7 +29,7 @@ from brmgeo.synth.imagery import render_imagery
 from brmgeo.synth.town import generate_town
 from brmgeo.workflow.store import Store
 from pipelines.cli import cli, run
-from pipelines.training import held_ground, plan_tiles, require_trainable
+from pipelines.training import held_ground, none_left, plan_tiles, require_trainable
 
 Capture = pytest.CaptureFixture[str]
 REAL = Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
@@ -199,6 +200,30 @@ def test_other_settings_leave_no_shard_of_the_old_ones(
     }
 
 
+def test_files_of_the_users_own_stay_beside_the_tiles(
+    tiled: SmallRegion, tmp_path: Path, capsys: Capture
+) -> None:
+    region = tiled.copied_to(tmp_path / "data")
+    own = {"small-backup.tar", "small-0800-777.tar", "small-0800-000.tar.part"}
+    for name in own:
+        (region.out / "tiles" / name).write_bytes(b"mine")
+    assert cut(capsys, region, "--gsd", "1.7", "--split", "test").status == 0
+    shards = {s["file"] for s in tiles_of(region).facts["shards"]}
+    assert {p.name for p in (region.out / "tiles").glob("*.tar*")} == shards | own
+
+
+def test_gsds_equal_to_the_millimetre_are_refused(
+    tiled: SmallRegion, tmp_path: Path, capsys: Capture
+) -> None:
+    assert (
+        "[0.8001, 0.8004] are the same to the millimetre"
+        in cut(capsys, tiled, "--gsd", "0.8001,0.8004").error
+    )
+    region = tiled.copied_to(tmp_path / "data", store=False)
+    region.edit("gsd_m = [0.8, 1.7]", "gsd_m = [0.8001, 1.7, 0.8004]")
+    assert "small.toml: training: two of 'gsd_m'" in cut(capsys, region).error
+
+
 @pytest.mark.slow
 def test_workers_give_the_same_bytes(tiled: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
     region = tiled.copied_to(tmp_path / "data", store=False)
@@ -257,6 +282,63 @@ def test_real_ground_that_is_held_out_is_kept_out_of_neighbours(
     assert max(info.bounds[2] for info in tiles.infos) <= right - 60 - 12
 
 
+def test_where_all_tiles_are_left_out_the_reasons_are_told(
+    tiled: SmallRegion, tmp_path: Path, capsys: Capture
+) -> None:
+    region = tiled.copied_to(tmp_path / "data")
+    text = region.toml.read_text(encoding="utf-8").replace('name = "small"', 'name = "other"')
+    (region.data / "regions" / "other.toml").write_text(text + "hold_out = true\n", encoding="utf-8")
+    error = cut(capsys, region, "--split", "train", "--gsd", "1.7").error
+    assert "no tile is left: 20 on held-out ground; that of other: give other bounds" in error
+    said = none_left("r", {"empty": 3, "unknown": 12}, {"unknown": "look there"})
+    assert said == "r: no tile is left: 12 unknown, 3 without building; look there"
+
+
+def test_imagery_beside_the_region_is_told(tiled: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
+    region = tiled.copied_to(tmp_path / "data", store=False)
+    text = region.toml.read_text(encoding="utf-8")
+    start, end = text.index("[imagery]"), text.index("[ratio]")
+    text = text[:start] + '[imagery]\nkind = "raster"\npath = "far.tif"\n' + text[end:]
+    region.toml.write_text(text.replace("gsd_m = [0.8, 1.7]", "gsd_m = [1.7]"), encoding="utf-8")
+    far = Affine(1.0, 0.0, BOUNDS[0] + 5000, 0.0, -1.0, BOUNDS[3])
+    shape = {"width": 64, "height": 64, "count": 3, "dtype": "uint8", "crs": CRS, "transform": far}
+    with rasterio.open(region.tiles.parent / "far.tif", "w", driver="GTiff", **shape) as out:
+        out.write(np.full((3, 64, 64), 90, np.uint8))
+    assert "no image lies on the region: the nearest" in cut(capsys, region).error
+
+
+def test_a_held_out_region_far_away_stops_none(tiled: SmallRegion, tmp_path: Path) -> None:
+    region = tiled.copied_to(tmp_path / "data", store=False)
+    text = 'name = "far"\ncrs = "EPSG:32636"\nbounds = [454330, 38480, 455017, 38859]\n[training]\nhold_out = true\n'
+    (region.data / "regions" / "far.toml").write_text(text, encoding="utf-8")
+    assert held_ground(load_region(region.toml), region.data) == []
+
+
+def test_a_copy_of_a_held_out_town_is_not_trained_on(tmp_path: Path) -> None:
+    (tmp_path / "regions").mkdir()
+    text = (REGIONS / "town-a.toml").read_text(encoding="utf-8")
+
+    def town(name: str, *changes: tuple[str, str]) -> None:
+        new = text.replace('name = "town-a"', f'name = "{name}"')
+        for before, after in changes:
+            assert before in new
+            new = new.replace(before, after)
+        path = tmp_path / "regions" / f"{name}.toml"
+        path.write_text(new, encoding="utf-8")
+        require_trainable(load_region(path), tmp_path)
+
+    town("first")
+    (tmp_path / "source" / "first" / "flights" / "x").mkdir(parents=True)
+    (tmp_path / "source" / "first" / "flights" / "x" / "flight.toml").touch()
+    for number, changes in enumerate(((), (("style = 28", 'style = 28\nseason = "winter"'),))):
+        with pytest.raises(SettingsError, match="the same generated town as first, which is held out or"):
+            town(f"copy-{number}", *changes)
+    town("other", ("seed = 101", "seed = 109"))
+    town(
+        "elsewhere", ("[180460.0, 456580.0, 181560.0, 457680.0]", "[181600.0, 456580.0, 182700.0, 457680.0]")
+    )
+
+
 def test_gsds_much_finer_than_the_imagery_are_left_out(
     tiled: SmallRegion, tmp_path: Path, capsys: Capture
 ) -> None:
@@ -285,7 +367,9 @@ def test_blank_and_missing_imagery_is_dropped_and_counted(
     assert dropped["unknown"] > 0
     for path in pictures[:-1]:
         cv2.imwrite(str(path), blank)
-    assert "no tile is left" in cut(capsys, region).error
+    assert " blank, " in (error := cut(capsys, region).error)
+    assert "no tile is left" in error
+    assert error.endswith("see that the imagery is not of one colour there")
 
 
 def test_filler_is_no_ground(tiled: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
@@ -322,6 +406,7 @@ def test_options_are_refused_in_one_line(tiled: SmallRegion, tmp_path: Path, cap
     start, end = text.index("[imagery]"), text.index("[ratio]")
     plain.toml.write_text(text[:start] + text[end:], encoding="utf-8")
     assert "has no imagery" in cut(capsys, plain).error
+    assert not plain.out.exists()
 
 
 # --- labels beside the imagery -----------------------------------------------------------------------------------
@@ -433,6 +518,57 @@ def test_pairs_become_tiles_as_they_are(pairs: tuple[Path, Path], capsys: Captur
     assert "start" not in make(capsys, pairs, "--terms", "CC BY 4.0", "--name", "city").err
 
 
+def test_pairs_left_out_are_counted_by_reason(pairs: tuple[Path, Path], capsys: Capture) -> None:
+    rng = np.random.default_rng(7)
+    cloud = rng.integers(232, 239, (48, 64, 1), dtype=np.uint8).repeat(3, axis=2)
+    cloud[8:21, 10:40] = rng.integers(0, 256, (13, 30, 3))
+    cv2.imwrite(str(pairs[0] / "p 1.png"), cloud)
+    for name in ("e 0.png", "e 1.png", "e 2.png"):
+        shutil.copy(pairs[0] / "p 3.png", pairs[0] / name)
+        cv2.imwrite(str(pairs[1] / name), np.zeros((48, 64), np.uint8))
+    said = make(capsys, pairs)
+    assert "3 tiles (train), 5 left out (3 without building, 1 cloudy, 1 unknown)" in said.err
+    survey = read_tiles(pairs[0].parent / "out").facts["survey"]
+    assert (survey["candidates"], survey["kept"]) == (8, 3)
+    assert survey["dropped"] == {"cloudy": 1, "empty": 3, "unknown": 1}
+    assert survey["ground"]["empty"] == 3
+    assert make(capsys, pairs, "--empty-share", "0.5").status == 0
+    tiles = read_tiles(pairs[0].parent / "out")
+    assert sorted(info.building_share == 0 for info in tiles.infos) == [False] * 3 + [True] * 3
+    for path in pairs[1].iterdir():
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
+    error = make(capsys, pairs).error
+    assert "no tile is left: 7 without building, 1 unknown; --empty-share 1 keeps them" in error
+    assert make(capsys, pairs, "--empty-share", "1").status == 0
+    assert len(read_tiles(pairs[0].parent / "out")) == 7
+    assert "no share of the tiles" in make(capsys, pairs, "--empty-share", "nan").error
+
+
+def test_pictures_of_a_flight_are_for_testing_only(pairs: tuple[Path, Path], capsys: Capture) -> None:
+    (pairs[0].parent / "flight.toml").touch()
+    for split in ("train", "validation"):
+        error = make(capsys, pairs, "--split", split).error
+        assert f"{pairs[0]} is of a flight" in error
+    assert not (pairs[0].parent / "out").exists()
+    assert make(capsys, pairs, "--split", "test").status == 0
+
+
+def test_tiles_of_something_else_are_not_mixed_with(
+    tiled: SmallRegion, tmp_path: Path, pairs: tuple[Path, Path], capsys: Capture
+) -> None:
+    out = tmp_path / "there"
+    shutil.copytree(tiled.out / "tiles", out)
+    before = sorted(p.name for p in out.iterdir())
+    assert "holds tiles of small, which those of pairs would" in make(capsys, pairs, "--out", out).error
+    assert sorted(p.name for p in out.iterdir()) == before
+    assert make(capsys, pairs, "--out", out, "--name", "small").status == 0
+    assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {
+        "index.csv", "tiles.json", "small-000.tar",
+    }  # fmt: skip
+    (out / "tiles.json").write_text('{"mine": 1}')
+    assert "holds another tiles.json" in make(capsys, pairs, "--out", out).error
+
+
 def test_names_that_a_key_cannot_tell_apart_get_numbers(pairs: tuple[Path, Path], capsys: Capture) -> None:
     for folder in pairs:
         shutil.copy(folder / "p 1.png", folder / "p-1.png")
@@ -447,8 +583,8 @@ def test_names_that_a_key_cannot_tell_apart_get_numbers(pairs: tuple[Path, Path]
         ("no mask", "1 pictures have no partner, such as p 3"),
         ("no folder", "is not a folder"),
         ("empty folder", "holds no picture"),
-        ("odd value", "holds the value 9"),
-        ("coloured mask", "one band"),
+        ("odd value", "masks/p 3.png: holds the value 9"),
+        ("coloured mask", "masks/p 3.png: a mask has one band"),
         ("other size", "64 x 40 px, its image"),
         ("16 bit", "holds uint16 values"),
         ("damaged", "damaged or cut short"),
