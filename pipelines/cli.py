@@ -548,6 +548,7 @@ def localize(
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
     from pipelines import flights as job
     from pipelines.masks import NetworkUse
+    from pipelines.regions import note_flown
 
     own, folder, attribution = job.maps_for("localize", region, maps_dir, data, scheduler)
     if flight is None:
@@ -581,6 +582,8 @@ def localize(
         network=use,
         attribution=attribution,
     )
+    if region is not None:
+        note_flown(own.name, data, out)
 
 
 @cli.command()
@@ -656,6 +659,7 @@ def evaluate(
     """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
     from pipelines import flights as job
     from pipelines.maps import native_imagery
+    from pipelines.regions import note_flown
 
     if results:
         click.echo(job.compare_results(results, out))
@@ -697,6 +701,8 @@ def evaluate(
                 compared, sift, drawn,
             )
         )  # fmt: skip
+    if region is not None:
+        note_flown(own.name, data, out)
 
 
 @cli.command()

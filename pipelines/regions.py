@@ -66,6 +66,19 @@ def region_named(name: str, data: Path) -> tuple[Region, Path]:
     return load_region(data / "regions" / f"{name}.toml"), data
 
 
+def flown_mark(name: str, data: Path) -> Path:
+    """The file that says that a region has been flown over with results elsewhere than below its own folders."""
+    return data / "work" / "flown" / name
+
+
+def note_flown(name: str, data: Path, out: Path) -> None:
+    """Keeps in mind that results over a region went to ``out``: such a region is not trained on."""
+    mark = flown_mark(name, data)
+    if not out.absolute().is_relative_to((data / "out" / name).absolute()):
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+
+
 def town_style(style: int | None, season: str | None) -> TownStyle | None:
     """The style of a generated region by the keys of its [generate]; None, the plain one, without them."""
     from brmgeo.synth.scene import TownStyle

@@ -62,7 +62,7 @@ from brmgeo.workflow.stage import Json, Map, Stage
 from brmgeo.workflow.store import Artifact, Input, Store, publish
 from pipelines import maps
 from pipelines.maps import Inputs, read_lattice
-from pipelines.regions import region_named
+from pipelines.regions import flown_mark, region_named
 
 COARSE = 8  # the survey looks at imagery in pixels this many times larger
 FINEST = 1.3  # tiles may be this many times finer than their imagery, no more: upsampled pictures teach blur
@@ -625,11 +625,13 @@ def plan_tiles(
 
 
 def flights_over(name: str, data: Path) -> list[str]:
-    """Names of the flights, own or simulated, that lie below a region's folders, an evaluation's among them."""
+    """Names of the flights, own or simulated, over a region: those below its folders and what was noted of others."""
     found = {p.parent.name for p in (data / "source" / name / "flights").glob("*/flight.toml")}
     found |= {p.name for p in (data / "out" / name / "flights").glob("*") if p.is_dir()}
     if (data / "out" / name / "evaluation").is_dir():
         found.add("the simulated flights of brmgeo evaluate")
+    if (mark := flown_mark(name, data)).is_file():
+        found.add(f"flights with results elsewhere ({mark} says so)")
     return sorted(found)
 
 

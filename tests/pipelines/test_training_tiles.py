@@ -233,6 +233,22 @@ def test_workers_give_the_same_bytes(tiled: SmallRegion, tmp_path: Path, capsys:
             assert path.read_bytes() == (region.out / "tiles" / path.name).read_bytes(), path.name
 
 
+def test_flights_with_results_elsewhere_are_remembered(
+    tiled: SmallRegion, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    region = tiled.copied_to(tmp_path / "data")
+    for name, value in {"localize": None, "flight_name": "f"}.items():
+        monkeypatch.setattr(f"pipelines.flights.{name}", lambda *args, value=value, **kw: value)
+    words = ("localize", "small", "--data", region.data, "--flight", tmp_path)
+    assert brmgeo(capsys, *words).status == 0
+    require_trainable(load_region(region.toml), region.data)
+    assert brmgeo(capsys, *words, "--out", tmp_path / "elsewhere").status == 0
+    with pytest.raises(
+        Exception, match=r"flown over by flights with results elsewhere \(.*flown/small says so\)"
+    ):
+        require_trainable(load_region(region.toml), region.data)
+
+
 def test_held_out_and_flown_regions_are_for_testing_only(
     tiled: SmallRegion, tmp_path: Path, capsys: Capture
 ) -> None:
