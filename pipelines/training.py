@@ -447,7 +447,11 @@ def run_index(inputs: Inputs, out: Path, settings: Json, map: Map) -> Json:
         "labels": {"0": "other", "127": "unknown", "255": "building"},
         "by_gsd_m": _counted(rows, "gsd_m"),
         "by_split": _counted(rows, "split"),
-        "splits": {split: _told(tally) for split, tally in tallies.items() if tally.tiles},
+        "splits": {
+            split: _told(tally) | {"by_gsd_m": _counted([r for r in rows if r["split"] == split], "gsd_m")}
+            for split, tally in tallies.items()
+            if tally.tiles
+        },
         # Of training tiles wherever there are some; brmgeo's own network is normalised with constants instead.
         "statistics": {"split": statistics} | _colour_told(tallies[statistics]),
         "survey": facts,
@@ -522,7 +526,7 @@ def _write_gpkg(path: Path, rows: Sequence[Json], credit: str, blocks: Sequence[
 ALIGNMENT = Stage("alignment", 1, run_alignment)
 SURVEY = Stage("tile-survey", 2, run_survey)
 TILES = Stage("tiles", 2, run_tiles)
-INDEX = Stage("tile-index", 1, run_index)
+INDEX = Stage("tile-index", 2, run_index)
 
 
 # --- the plan -----------------------------------------------------------------------------------------------------

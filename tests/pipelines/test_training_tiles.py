@@ -133,6 +133,9 @@ def test_tiles_json_counts_what_is_there(tiled: SmallRegion) -> None:
     facts = tiles.facts
     assert facts["tiles"] == len(tiles)
     assert sum(facts["by_gsd_m"].values()) == len(tiles)
+    for split, own in facts["splits"].items():
+        found = [tiles.infos[i].gsd_m for i in tiles.of_split(split)]
+        assert own["by_gsd_m"] == {str(gsd): found.count(gsd) for gsd in sorted(set(found))}
     assert facts["survey"]["kept"] == len(tiles)
     assert facts["survey"]["kept"] + sum(facts["survey"]["dropped"].values()) == facts["survey"]["candidates"]
     for split, told in facts["splits"].items():
