@@ -537,8 +537,8 @@ class _RasterReader:
     ) -> None:
         if src.crs is None and path.suffix.lower() in (".jpg", ".jpeg", ".png"):
             raise InputError(
-                f"{path}: a picture without place or scale, such as a frame: give the folder that holds it, with --gsd "
-                "METRES per pixel where it is not that of the weights"
+                f"{path}: a picture without place or scale, such as a frame: give the folder that holds it, with --gsd, "
+                "metres per pixel"
             )
         if src.crs is None:
             raise InputError(

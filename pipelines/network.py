@@ -438,7 +438,10 @@ def with_terms(spec: SourceSpec, data: Path, paths: Mapping[str, Path]) -> Sourc
 
     if not spec.regions:
         sources = read_tiles(paths[spec.name]).facts.get("sources") or []
-        told = {"attribution": [s["attribution"] for s in sources], "licence": [s["terms"] for s in sources]}
+        told = {
+            "attribution": [s.get("attribution") for s in sources],
+            "licence": [s.get("terms") for s in sources],
+        }
     else:
         regions = [region_named(name, data)[0] for name in spec.regions]
         told = {
@@ -536,9 +539,8 @@ def _held_seeds(data: Path) -> dict[int, str]:
     """Seeds of the generated regions that are held out for tests, with the regions' names."""
     found = {}
     for path in sorted((data / "regions").glob("[!_]*.toml")):
-        with contextlib.suppress(
-            InputError, SettingsError
-        ):  # a faulty file is told when its region is asked for
+        # A faulty file is told when its region is asked for.
+        with contextlib.suppress(InputError, SettingsError):
             region = load_region(path)
             if region.generate and region.training.hold_out:
                 found[region.generate.seed] = region.name

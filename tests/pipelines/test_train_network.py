@@ -168,6 +168,30 @@ def test_roofs_are_laid_onto_their_outlines_on_the_ground() -> None:
     assert set(over[np.isfinite(over)]) == {1.0}
 
 
+def test_answers_are_scored_as_they_are_and_laid_down() -> None:
+    label = np.zeros((60, 80), np.uint8)
+    label[20:40, 10:50] = 255
+    label[:, 70:] = 127
+    seen = np.roll(label == 255, -4, axis=0).astype(np.float32)  # roofs stand four rows above their outlines
+
+    def laid(answer: np.ndarray) -> np.ndarray:
+        down = np.roll(answer, 4, axis=0)
+        down[:4] = np.nan
+        return down
+
+    picture = network.Picture(lambda: (np.zeros((60, 80, 3), np.uint8), label), 0.2, laid, 2.0)
+    segmenter: Any = types.SimpleNamespace(
+        probability=lambda image, gsd_m: seen, card=types.SimpleNamespace(threshold=0.5)
+    )
+    found = network.score(segmenter, [picture, picture])
+    assert set(found) == {"", ", laid down from 2 m"}
+    assert found[""].summary()["iou"] == pytest.approx(16 / 24, abs=1e-4)
+    assert found[", laid down from 2 m"].summary()["iou"] == 1.0
+    # Two frames: the whole but for unknown ground, and in the second row but for what lies beyond the frame.
+    known = [s.hit + s.false + s.missed + s.rest for s in found.values()]
+    assert known == [2 * 60 * 70, 2 * 56 * 70]
+
+
 @pytest.mark.skipif(
     not (REAL / "flight-sheffield").exists(), reason="real flight not here: set BRMGEO_REAL_DATA"
 )
