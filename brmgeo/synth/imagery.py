@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import cv2
+import numba as nb
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -140,6 +141,24 @@ def _sensor_noise(seed: int, sigma: float) -> F32:
     return _tiled(both.astype(np.float32))
 
 
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _raise_domes(height, owner, radius, cx, cy, lift, gsd_m):  # type: ignore[no-untyped-def]
+    # height (n, n) float32 and owner (n, n) int32, periodic, are lifted to the domes (1-based in owner) that stand higher.
+    size = height.shape[0]
+    for k in range(radius.size):
+        r = radius[k] / gsd_m
+        rise = 1.15 * radius[k]
+        x0, y0, n = int(cx[k] - r), int(cy[k] - r), int(2 * r) + 2
+        for y in range(y0, y0 + n):
+            for x in range(x0, x0 + n):
+                d2 = ((x - cx[k]) ** 2 + (y - cy[k]) ** 2) / (r * r)
+                if d2 < 1:
+                    dome = np.float32(rise * math.sqrt(1 - d2) + lift[k])
+                    if dome > height[y % size, x % size]:
+                        height[y % size, x % size] = dome
+                        owner[y % size, x % size] = k + 1
+
+
 @lru_cache(maxsize=8)
 def _canopy(seed: int, season: Season, gsd_m: float, azimuth_deg: float, elevation_deg: float) -> U8:
     """(P, P, 3) uint8 periodic closed forest seen from above: lit domes of many sizes, dark gaps between them."""
@@ -152,17 +171,7 @@ def _canopy(seed: int, season: Season, gsd_m: float, azimuth_deg: float, elevati
     radius = np.sort(np.clip(rng.lognormal(0.72, 0.32, count), 0.9, 4.6))
     cx, cy = rng.uniform(0, size, (2, count))
     lift = rng.uniform(0.0, 2.6, count)
-    for k in range(count):
-        r = radius[k] / gsd_m
-        x0, y0, n = int(cx[k] - r), int(cy[k] - r), int(2 * r) + 2
-        xs, ys = np.arange(x0, x0 + n), np.arange(y0, y0 + n)
-        d2 = ((xs[None, :] - cx[k]) ** 2 + (ys[:, None] - cy[k]) ** 2) / (r * r)
-        dome = (1.15 * radius[k] * np.sqrt(np.maximum(1 - d2, 0)) + lift[k]).astype(np.float32)
-        at = np.ix_(ys % size, xs % size)
-        old = height[at]
-        higher = (dome > old) & (d2 < 1)
-        height[at] = np.where(higher, dome, old)
-        owner[at] = np.where(higher, k + 1, owner[at])
+    _raise_domes(height, owner, radius, cx, cy, lift, gsd_m)
     rough = np.tile(_noise(seed + 5, max(0.35 / gsd_m, 0.6))[:_PERIOD_PX, :_PERIOD_PX], (2, 2))[:size, :size]
     height += 0.22 * rough
     east = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) / (2 * gsd_m)

@@ -289,15 +289,15 @@ def test_weights_of_another_network_are_refused_before_any_ground_is_painted(tmp
 
 
 def test_a_generated_scene_is_painted_once_and_labels_its_roofs(tmp_path: Path) -> None:
-    scene = network.generated_scene(901, 300.0, 0.25, 0, tmp_path)
+    scene = network.generated_scene(901, 300.0, 0.5, 0, tmp_path)
     (file,) = tmp_path.iterdir()
     before = file.stat().st_mtime_ns
-    again = network.generated_scene(901, 300.0, 0.25, 0, tmp_path)
+    again = network.generated_scene(901, 300.0, 0.5, 0, tmp_path)
     assert file.stat().st_mtime_ns == before
     np.testing.assert_array_equal(scene.image, again.image)
     assert 0.01 < (scene.label == 255).mean() < 0.5
     assert {*np.unique(scene.label)} == {0, 255}
-    winter = network.generated_scene(901, 300.0, 0.25, 1, tmp_path)
+    winter = network.generated_scene(901, 300.0, 0.5, 1, tmp_path)
     np.testing.assert_array_equal(scene.label, winter.label)
     assert (scene.image != winter.image).mean() > 0.5
 
@@ -560,6 +560,7 @@ def test_weights_are_for_the_looks_that_validation_asks_for(
         return [own]
 
     monkeypatch.setattr(network, "_histograms", histograms)
+    monkeypatch.setattr("brmgeo.segment.onnx_export.export_onnx", lambda weights, out: out.touch())
     recipe_path = tmp_path / "tiny.toml"
     recipe_path.write_text(TINY)
     unet = UNetSettings(widths=(8, 16))
@@ -570,33 +571,45 @@ def test_weights_are_for_the_looks_that_validation_asks_for(
         tmp_path, lambda _: None, 4,
     )  # fmt: skip
     assert facts["calibration"]["looks"] == better
-    assert Segmenter.load(tmp_path / "model.safetensors").looks == better
+    assert Segmenter.load(tmp_path / "model.safetensors", "torch").looks == better
 
 
 def test_a_run_that_ends_while_it_finishes_leaves_the_weights_of_before(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    recipe, out = tmp_path / "tiny.toml", tmp_path / "out"
-    recipe.write_text(TINY)
-    network.train(recipe, tmp_path, out, say=lambda _: None)
-    before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    rng = np.random.default_rng(7)
+    image = rng.integers(0, 255, (64, 64, 3)).astype(np.uint8)
+    label = np.where(image[..., 0] > 128, 255, 0).astype(np.uint8)
+    frames = {"held": [network.Picture(lambda: (image, label), 0.25)]}
+    ground: Any = types.SimpleNamespace(validation=frames, test={}, credits=[])
+
+    def finish(seed: int) -> None:
+        unet = UNetSettings(widths=(8, 16))
+        torch.manual_seed(seed)
+        recipe = network.Recipe(title="tiny", work_gsd_m=0.25, source=())
+        state = UNet(unet).state_dict()
+        network.finish(state, unet, recipe, AugmentSettings(), ground, tmp_path, lambda _: None, 4)
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    # Weights, calibration and ONNX are made by then, all but the scores' picture.
-    monkeypatch.setattr(network, "_draw_reliability", killed)
+    def files() -> dict[str, bytes]:
+        return {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
+
+    with monkeypatch.context() as at_the_end:
+        at_the_end.setattr(network, "score", killed)  # weights are calibrated by then
+        with pytest.raises(KeyboardInterrupt):
+            finish(1)
+        assert files() == {}
+    (tmp_path / "metrics.json").write_text("of earlier weights")
+    finish(2)
+    before = files()
+    assert set(before) == {"model.safetensors", "model.md", "model.onnx", "reliability.png"}
+    assert not (tmp_path / ".finish").exists()
+    monkeypatch.setattr(network, "score", killed)
     with pytest.raises(KeyboardInterrupt):
-        network.train(recipe, tmp_path, out, say=lambda _: None)
-    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
-    with pytest.raises(KeyboardInterrupt):
-        network.train(recipe, tmp_path, tmp_path / "fresh", say=lambda _: None)
-    assert not list((tmp_path / "fresh").glob("model*"))
-    monkeypatch.undo()
-    network.train(recipe, tmp_path, out, say=lambda _: None)
-    after = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
-    assert {name for name, data in before.items() if after.get(name) != data} <= {"metrics.json"}
-    assert not (out / ".finish").exists()
+        finish(3)
+    assert files() == before
 
 
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
