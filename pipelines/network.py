@@ -138,7 +138,7 @@ def _read_with_base(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     base = own.pop("base", None)
     if base is None:
         return own
-    if not isinstance(base, str) or not base or Path(base).name != base:
+    if not isinstance(base, str) or not re.fullmatch(r"\w[\w.-]*", base):
         raise SettingsError(
             f"{path}: base is {base!r}: give the name of a recipe in the same folder, without .toml"
         )
@@ -419,6 +419,9 @@ def gather(
                 if getattr(spec, k)
             }
         )
+        if spec.kind == "tiles" and not spec.regions:
+            infos = read_tiles(paths[spec.name]).infos
+            credits[-1]["regions"] = tuple(sorted({info.region for info in infos}))
     if not train or not crops:
         raise SettingsError(f"recipe {recipe.title!r}: names no ground to train on, or none to validate on")
     for split, sets in frames.items():
@@ -437,10 +440,11 @@ def with_terms(spec: SourceSpec, data: Path, paths: Mapping[str, Path]) -> Sourc
     from pipelines.regions import region_named
 
     if not spec.regions:
-        sources = read_tiles(paths[spec.name]).facts.get("sources") or []
+        listed = read_tiles(paths[spec.name]).facts.get("sources")
+        sources = [s for s in listed if isinstance(s, dict)] if isinstance(listed, list) else []
         told = {
-            "attribution": [s.get("attribution") for s in sources],
-            "licence": [s.get("terms") for s in sources],
+            "attribution": [str(s.get("attribution") or "") for s in sources],
+            "licence": [str(s.get("terms") or "") for s in sources],
         }
     else:
         regions = [region_named(name, data)[0] for name in spec.regions]
@@ -515,15 +519,8 @@ def _checked(
             raise SettingsError(f"recipe source {spec.name}: pairs are for training, and need their gsd_m")
         if spec.kind == "tiles":
             training.require_all_trainable(spec.regions, data, spec.split)
-            if (
-                spec.name in paths
-                and spec.split != "test"
-                and read_tiles(paths[spec.name]).facts.get("hold_out")
-            ):
-                raise SettingsError(
-                    f"recipe source {spec.name}: the tiles in {paths[spec.name]} are of a held-out region; "
-                    'name another folder, or give split = "test"'
-                )
+            if spec.name in paths:
+                _require_usable(spec, paths, data)
         if spec.name not in names or spec.name in paths:
             used.append(spec)
         elif spec.split == "test":
@@ -533,6 +530,30 @@ def _checked(
                 f"recipe {recipe.title!r} trains on {spec.name}: give its folder, --source {spec.name}=PATH"
             )
     return used
+
+
+def _require_usable(spec: SourceSpec, paths: Mapping[str, Path], data: Path) -> None:
+    """Raises SettingsError for a folder of tiles that are for testing, or that another source names too."""
+    from pipelines import training
+
+    folder = paths[spec.name]
+    for name, other in paths.items():
+        if name != spec.name and other.resolve() == folder.resolve():
+            raise SettingsError(
+                f"--source {spec.name} and {name} are one folder, {folder}: give it to one of them"
+            )
+    tiles = read_tiles(folder)
+    if spec.split == "test":
+        return
+    tested = spec.split == "validation" and tiles.of_split("test")
+    if tested or tiles.facts.get("hold_out"):
+        raise SettingsError(
+            f"recipe source {spec.name}: the tiles in {folder} are for testing; name another folder, or give "
+            'split = "test"'
+        )
+    for region in sorted({info.region for info in tiles.infos}):
+        if (file := data / "regions" / f"{region}.toml").is_file():
+            training.require_trainable(load_region(file), data)
 
 
 def _held_seeds(data: Path) -> dict[int, str]:
@@ -633,7 +654,11 @@ def _tile_sources(
             if not parts["train"]:
                 raise SettingsError(
                     f"recipe source {spec.name}: {what} has no tile to train on (its split is for other uses); take it out, "
-                    'or set split = "blocks" in its region file'
+                    + (
+                        'or set split = "blocks" in its region file'
+                        if spec.regions
+                        else "or cut it with --split train"
+                    )
                 )
         else:
             parts = {spec.split: list(range(len(tiles)))}
@@ -942,7 +967,9 @@ def licence_of(credits: Sequence[Mapping[str, Any]]) -> str:
     asked = []
     for credit in _with_earlier(credits):
         licence, attribution = credit.get("licence"), credit.get("attribution")
-        if not licence and credit.get("kind") in ("tiles", "pairs", "xyz") and credit.get("split") != "test":
+        if credit.get("split") == "test":
+            continue
+        if not licence and credit.get("kind") in ("tiles", "pairs", "xyz"):
             licence = "terms not stated"
         if licence:
             asked.append(f"{credit['name']}: " + (f"{attribution} ({licence})" if attribution else licence))

@@ -67,14 +67,15 @@ def region_named(name: str, data: Path) -> tuple[Region, Path]:
 
 
 def flown_mark(name: str, data: Path) -> Path:
-    """The file that says that a region has been flown over with results elsewhere than below its own folders."""
-    return data / "work" / "flown" / name
+    """The file that says that a region has been flown over with results where nobody looks for them."""
+    return data / "source" / name / "flown"
 
 
 def note_flown(name: str, data: Path, out: Path) -> None:
     """Keeps in mind that results over a region went to ``out``: such a region is not trained on."""
-    mark = flown_mark(name, data)
-    if not out.absolute().is_relative_to((data / "out" / name).absolute()):
+    usual = ((data / "out" / name / part).resolve() for part in ("flights", "evaluation"))
+    if not any(out.resolve().is_relative_to(place) for place in usual):
+        mark = flown_mark(name, data)
         mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()
 

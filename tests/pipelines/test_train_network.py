@@ -276,7 +276,8 @@ def test_terms_of_training_tiles_are_those_of_their_regions(tmp_path: Path) -> N
     # What nobody states is not taken for free.
     pairs = {"name": "far", "kind": "pairs", "split": "train"}
     assert network.licence_of([pairs]).endswith("trained on far: terms not stated")
-    assert network.licence_of([{**pairs, "split": "test"}]) == "Apache-2.0 for the weights"
+    for more in ({}, {"licence": "CC BY-NC 4.0"}):
+        assert network.licence_of([{**pairs, "split": "test", **more}]) == "Apache-2.0 for the weights"
 
 
 def test_weights_of_another_network_are_refused_before_any_ground_is_painted(tmp_path: Path) -> None:
@@ -423,16 +424,14 @@ def test_tiles_in_a_folder_are_a_source(tmp_path: Path) -> None:
         picture = rng.integers(0, 255, (80, 90, 3)).astype(np.uint8)
         cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), picture)
         cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), label)
-    pairs = (tmp_path / "images", tmp_path / "masks")
-    for split in ("train", "test"):
-        training.cut_pairs(
-            *pairs, tmp_path / split, 0.25, split, split, "Those who flew", "CC BY 4.0", "serial"
-        )
+    given = (tmp_path / "images", tmp_path / "masks")
+    splits = {"train": "train", "validation": "validation", "test": "test", "far": "test"}
+    for name, split in splits.items():
+        out, by = tmp_path / name, ("Those who flew", "CC BY 4.0")
+        training.cut_pairs(*given, out, 0.25, name, split, *by, "serial")
     source = '[[source]]\nkind = "tiles"\nname = "{0}"\nsplit = "{0}"\n'
-    own = TINY[: TINY.index("[[source]]")] + "".join(
-        source.format(s) for s in ("train", "validation", "test")
-    )
-    paths = dict.fromkeys(("train", "validation", "test"), tmp_path / "train")
+    paths = {split: tmp_path / split for split in ("train", "validation", "test")}
+    own = TINY[: TINY.index("[[source]]")] + "".join(source.format(split) for split in paths)
     ground = gather(own, tmp_path, **paths)
     image, label, gsd_m, _ = ground.train.patch(np.random.default_rng(1), 10.0, 1.0)
     assert (image.shape, label.shape, gsd_m) == ((80, 90, 3), (80, 90), 0.25)
@@ -440,10 +439,24 @@ def test_tiles_in_a_folder_are_a_source(tmp_path: Path) -> None:
     assert len(ground.validation["validation"]) == len(ground.test["test"]) == 3
     credit = ground.credits[0]
     assert (credit["attribution"], credit["licence"]) == ("Those who flew", "CC BY 4.0")
-    with pytest.raises(SettingsError, match="are of a held-out region"):
-        gather(own, tmp_path, **paths | {"train": tmp_path / "test"})
-    with pytest.raises(MissingInputError, match="holds no training tiles"):
-        gather(own, tmp_path, **paths | {"train": tmp_path / "images"})
+    assert credit["regions"] == ("train",)
+
+    def refused(told: str, **other: Path) -> None:
+        with pytest.raises((SettingsError, MissingInputError), match=told):
+            gather(own, tmp_path, **paths | other)
+
+    far = tmp_path / "far"
+    refused("source train: the tiles in .* are for testing", train=far)
+    facts = json.loads((far / "tiles.json").read_text()) | {"hold_out": False}
+    (far / "tiles.json").write_text(json.dumps(facts))
+    refused("source validation: the tiles in .* are for testing", validation=far)
+    refused("has no tile to train on .* or cut it with --split train", train=far)
+    refused("train and validation are one folder", validation=tmp_path / "train")
+    refused("holds no training tiles", train=tmp_path / "images")
+    (tmp_path / "regions").mkdir()
+    text = (ROOT / "data" / "regions" / "demo.toml").read_text().replace('name = "demo"', 'name = "train"')
+    (tmp_path / "regions" / "train.toml").write_text(text)
+    refused("region train is held out")
 
 
 def test_a_region_that_is_held_out_is_never_trained_on(tmp_path: Path) -> None:
