@@ -16,7 +16,6 @@ Folders that are not part of the project are given with ``--source NAME=PATH``.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import hashlib
 import io
@@ -558,14 +557,9 @@ def _require_usable(spec: SourceSpec, paths: Mapping[str, Path], data: Path) -> 
 
 def _held_seeds(data: Path) -> dict[int, str]:
     """Seeds of the generated regions that are held out for tests, with the regions' names."""
-    found = {}
-    for path in sorted((data / "regions").glob("[!_]*.toml")):
-        # A faulty file is told when its region is asked for.
-        with contextlib.suppress(InputError, SettingsError):
-            region = load_region(path)
-            if region.generate and region.training.hold_out:
-                found[region.generate.seed] = region.name
-    return found
+    from pipelines.regions import described_regions
+
+    return {r.generate.seed: r.name for r in described_regions(data) if r.generate and r.training.hold_out}
 
 
 def _reduced(scene: Scene, finest_m: float) -> Scene:

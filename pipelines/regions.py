@@ -7,6 +7,8 @@ import math
 import os
 import re
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,6 +66,13 @@ def region_named(name: str, data: Path) -> tuple[Region, Path]:
     if name.endswith(".toml") or "/" in name:
         return load_region(Path(name)), data
     return load_region(data / "regions" / f"{name}.toml"), data
+
+
+def described_regions(data: Path) -> Iterator[Region]:
+    """The regions of ``data``/regions; whoever asks for one with a faulty file is told then."""
+    for path in sorted((data / "regions").glob("[!_]*.toml")):
+        with suppress(SettingsError):
+            yield load_region(path)
 
 
 def flown_mark(name: str, data: Path) -> Path:

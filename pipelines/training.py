@@ -28,7 +28,7 @@ from odc.geo.geobox import GeoBox
 from brmgeo.errors import CrsError, InputError, MissingInputError, SettingsError
 from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
-from brmgeo.region import Region, TrainingSettings, load_region
+from brmgeo.region import Region, TrainingSettings
 from brmgeo.segment import OTHER, SPLITS, UNKNOWN
 from brmgeo.segment.predict import require_whole
 from brmgeo.segment.samples import blank_unknown
@@ -59,16 +59,15 @@ from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.stage import Json, Map, Stage
-from brmgeo.workflow.store import Artifact, Input, Store, publish
+from brmgeo.workflow.store import PUBLISHED, Artifact, Input, Store, publish
 from pipelines import maps
 from pipelines.maps import Inputs, read_lattice
-from pipelines.regions import flown_mark, region_named
+from pipelines.regions import described_regions, flown_mark, region_named
 
 COARSE = 8  # the survey looks at imagery in pixels this many times larger
 FINEST = 1.3  # tiles may be this many times finer than their imagery, no more: upsampled pictures teach blur
 SURVEY_TILES = 64
 PAIRS_A_SHARD = 512
-PUBLISHED = ".brmgeo-published.json"  # the store's own record of what it put into a folder of results
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192
 ARROW = 20.0
@@ -697,13 +696,9 @@ def held_ground(region: Region, data: Path) -> list[tuple[str, Bounds]]:
 
 def _tested_regions(region: Region, data: Path) -> Iterator[Region]:
     """The other regions that are held out, for testing only, or flown over."""
-    for path in sorted((data / "regions").glob("*.toml")):
-        if path.stem.startswith("_") or path.stem == region.name:
+    for other in described_regions(data):
+        if other.name == region.name:
             continue
-        try:
-            other = load_region(path)
-        except SettingsError:
-            continue  # whoever uses that region is told
         if other.training.hold_out or other.training.split == "test" or flights_over(other.name, data):
             yield other
 

@@ -36,7 +36,7 @@ from brmgeo.errors import BrmgeoError, InputError, MissingInputError, WorkflowEr
 from brmgeo.workflow.stage import Json, Map, Stage, key_of, plain
 
 RECORD = "provenance.json"
-_PUBLISHED = ".brmgeo-published.json"
+PUBLISHED = ".brmgeo-published.json"
 _PART = ".brmgeo-part-"
 
 _DISK_ERRORS = {
@@ -409,7 +409,7 @@ def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | 
         out.mkdir(parents=True, exist_ok=True)
         for litter in out.glob(f"{_PART}*"):
             litter.unlink(missing_ok=True)
-        known = _read_json(out / _PUBLISHED)
+        known = _read_json(out / PUBLISHED)
         known = known if isinstance(known, dict) else {}
         before = dict(known)
         try:
@@ -430,7 +430,7 @@ def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | 
                 del known[goal]
         finally:
             if known != before:
-                _replace_json(out / _PUBLISHED, known)
+                _replace_json(out / PUBLISHED, known)
         _sync_folder(out)
     return written
 
