@@ -2,17 +2,28 @@
 
 A message is one line that says what was asked, what was found, where, and what to do. The command line
 prints it and leaves with exit status 2; every other exception is a defect of brmgeo and keeps its traceback.
+
+The library knows no command line. Where a parameter would mend the fault, ``needs`` names it as the called function does
+(such as ``source_crs``), and a command line says which of its options that is.
 """
 
 from __future__ import annotations
 
 
 class BrmgeoError(Exception):
-    """Root of all errors that the user's input or machine can cause."""
+    """Root of all errors that the user's input or machine can cause.
+
+    Attributes:
+        needs: name of the parameter that would mend it, as the called function names it; None where there is none.
+    """
+
+    def __init__(self, *args: object, needs: str | None = None) -> None:
+        super().__init__(*args)
+        self.needs = needs
 
 
 class SettingsError(BrmgeoError):
-    """A region file, flight.toml or command option is malformed or out of range."""
+    """A region file, flight.toml or a parameter is malformed or out of range."""
 
 
 class InputError(BrmgeoError):
@@ -21,6 +32,10 @@ class InputError(BrmgeoError):
 
 class MissingInputError(InputError):
     """Inputs that the job needs are not there; the message lists which, where they go, where to get them."""
+
+
+class MissingExtraError(BrmgeoError):
+    """What was asked for needs libraries that a bare installation leaves out; the message names the extra."""
 
 
 class CrsError(BrmgeoError):

@@ -9,8 +9,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-VALUES = {
+# Floor 1: what every room stands on.
+FOUNDATION = {
     "brmgeo.errors",
+    "brmgeo.codes",
+    "brmgeo.files",
+    "brmgeo.settings",
+    "brmgeo.pictures",
+    "brmgeo.extras",
+}
+VALUES = FOUNDATION | {
     "brmgeo.region",
     "brmgeo.geo",
     "brmgeo.flight.values",
@@ -46,8 +54,13 @@ ADAPTERS = {
 # What each room may import besides itself and plain values; everything not named here may not be known.
 MAY_KNOW = {
     "brmgeo.errors": set[str](),
-    "brmgeo.region": {"brmgeo.errors"},
-    "brmgeo.geo": {"brmgeo.errors"},
+    "brmgeo.codes": set[str](),
+    "brmgeo.files": {"brmgeo.errors"},
+    "brmgeo.settings": {"brmgeo.errors"},
+    "brmgeo.pictures": {"brmgeo.errors"},
+    "brmgeo.extras": {"brmgeo.errors"},
+    "brmgeo.region": FOUNDATION,
+    "brmgeo.geo": FOUNDATION,
     "brmgeo.flight.values": set[str](),
     "brmgeo.maps": VALUES,
     "brmgeo.match": VALUES | {"brmgeo.maps.ratio", "brmgeo.flight.view"},
@@ -57,7 +70,7 @@ MAY_KNOW = {
     "brmgeo.evaluate": VALUES,
     "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
     "brmgeo.segment": VALUES | {"brmgeo.maps"},
-    "brmgeo.workflow": {"brmgeo.errors", "brmgeo"},
+    "brmgeo.workflow": FOUNDATION | {"brmgeo"},
 }
 # Libraries that live in one room only.
 ONLY_IN = {

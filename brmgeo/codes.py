@@ -1,0 +1,37 @@
+"""What stored numbers mean, and constants that several rooms share: each is written here and nowhere else."""
+
+from __future__ import annotations
+
+# Building masks of maps (buildings.tif): uint8.
+OTHER, BUILDING, UNKNOWN = 0, 1, 255
+
+# Labels of training tiles and masks of pictures: uint8. Masks of pictures have no unknown.
+LABEL_OTHER, LABEL_BUILDING, LABEL_UNKNOWN = 0, 255, 127
+
+# Ratios as stored: uint16 steps of RATIO_SCALE. 0 is a valid ratio, so unknown is not 0.
+RATIO_SCALE, RATIO_UNKNOWN = 1e-4, 65535
+
+#: Standard gravity, m/s2.
+GRAVITY_M_S2 = 9.80665
+
+#: NGII's building layers and what they hold. A third of all outlines are wall-less: canopies and walkways.
+BUILDING_KINDS = {
+    "B0014110": "unclassified",
+    "B0014111": "non-residential",
+    "B0014112": "house",
+    "B0014113": "row-house",
+    "B0014114": "under-construction",
+    "B0014115": "apartment",
+    "B0014116": "wall-less",
+    "B0014117": "greenhouse",
+    "B0014118": "temporary",
+}
+#: Layers that are buildings without being asked for: all but "unclassified".
+BUILDING_LAYERS = tuple(code for code in BUILDING_KINDS if code != "B0014110")
+#: Bounds a group of houses, and is no building.
+GROUP_BOUNDARY_LAYER = "B0014119"
+
+
+def disc_radii(largest: float, n: int) -> tuple[float, ...]:
+    """The n radii of eq. 3, largest first: R, R (n-1)/n, ..., R/n, in the unit of ``largest``."""
+    return tuple(largest * (n + 1 - k) / n for k in range(1, n + 1))

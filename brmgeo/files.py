@@ -1,0 +1,178 @@
+"""Files and folders that appear whole or not at all, what a disk says in words, digests, and a lock on any system."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import shutil
+import sys
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+#: Names of scratch files and folders begin with this, beside what they become.
+SCRATCH = ".brmgeo-part-"
+
+_REASONS = {
+    errno.ENOSPC: "the disk is full: free some space or choose another place",
+    errno.EDQUOT: "the disk quota is used up: free some space or choose another place",
+    errno.EFBIG: "the file is larger than this system allows: raise the limit (ulimit -f)",
+    errno.EROFS: "the file system is read-only: choose another place",
+    errno.EACCES: "permission is denied: change the owner or mode, or choose another place",
+    errno.EPERM: "the operation is not permitted: change the owner or mode, or choose another place",
+    errno.EEXIST: "a file stands where a folder is wanted: move it away or choose another place",
+    errno.ENOTDIR: "a file stands where a folder is wanted: move it away or choose another place",
+    errno.EISDIR: "a folder stands where a file is wanted: move it away or choose another place",
+    errno.ENOENT: "it is not there: check the name",
+    errno.EIO: "the disk reports an input/output error: check the disk",
+    errno.EMFILE: "too many files are open: raise the limit (ulimit -n)",
+    errno.ENAMETOOLONG: "the name is too long for this file system: choose a shorter place",
+}
+
+
+def reason(error: OSError) -> str | None:
+    """What is wrong and what to do, in words; None for an error that no user's disk or rights explain."""
+    return _REASONS.get(error.errno or 0)
+
+
+def reason_of(number: int) -> str:
+    """The words of an errno that ``reason`` knows."""
+    return _REASONS[number]
+
+
+# --- whole or not at all -----------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A scratch path beside ``path`` (same suffix) that takes its place when the block ends without an error.
+
+    The scratch file is removed after an error, so ``path`` holds the whole new file, or what it held before.
+    """
+    scratch = path.with_name(f"{SCRATCH}{uuid.uuid4().hex[:12]}{path.suffix}")
+    try:
+        yield scratch
+        os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> None:
+    """Writes a file whole; ``durable`` waits until the disk has it."""
+    with whole_file(path) as scratch, open(scratch, "wb") as handle:
+        handle.write(data)
+        if durable:
+            handle.flush()
+            os.fsync(handle.fileno())
+
+
+def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+    """Writes a file of UTF-8 text whole, line ends as they are; names that are no UTF-8 keep their bytes."""
+    write_bytes(path, text.encode("utf-8", errors="surrogateescape"), durable=durable)
+
+
+def write_json(path: Path, value: Any, *, durable: bool = False) -> None:
+    """Writes a file of JSON whole, for people to read too."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n", durable=durable)
+
+
+def read_json(path: Path) -> Any | None:
+    """The JSON in a file, or None when it is absent or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return None
+
+
+@contextlib.contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """An empty scratch folder beside ``out`` that takes its place when the block ends without an error.
+
+    What stood at ``out`` goes with it; after an error it stays as it was. Whoever calls this has made sure that nothing
+    there is missed.
+    """
+    out = out.absolute()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scratch = out.with_name(f"{SCRATCH}{uuid.uuid4().hex[:12]}")
+    old = out.with_name(f"{scratch.name}.old")
+    scratch.mkdir()
+    try:
+        yield scratch
+        if out.exists():
+            os.rename(out, old)
+        try:
+            os.rename(scratch, out)
+        except BaseException:
+            if old.exists():
+                os.rename(old, out)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+# --- contents ----------------------------------------------------------------------------------------------------
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file's content, 64 hexadecimal digits."""
+    with open(path, "rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def digest_of(text: str | bytes) -> str:
+    """SHA-256 of a text (its UTF-8) or of bytes, 64 hexadecimal digits."""
+    return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
+
+
+_FICLONE = 0x40049409
+
+
+def copy(source: Path, target: Path) -> None:
+    """A durable copy at a new path; shares blocks with its source on file systems that can (copy on write)."""
+    with open(source, "rb") as reader, open(target, "xb") as writer:
+        shared = False
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(writer.fileno(), _FICLONE, reader.fileno())
+                shared = True
+        if not shared:
+            shutil.copyfileobj(reader, writer, 1 << 20)
+        writer.flush()
+        os.fsync(writer.fileno())
+
+
+# --- locks -------------------------------------------------------------------------------------------------------
+
+
+def open_lock(path: Path) -> int:
+    """A descriptor of a lock file, made where it is not there; no child process inherits it. Close it with os.close."""
+    return os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
+
+
+def take_lock(descriptor: int, *, wait: bool) -> bool:
+    """Locks an open file against other processes until it is closed; False when another has it and ``wait`` is not set."""
+    if sys.platform == "win32":
+        # One byte far beyond what is written: the holder's name stays readable.
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)
+        while True:
+            try:
+                msvcrt.locking(descriptor, msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
+                return True
+            except OSError:
+                if not wait:
+                    return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    return True

@@ -1,0 +1,107 @@
+"""Whole files and folders, words for what a disk says, digests and locks."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from brmgeo import files
+
+
+def test_a_file_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    files.write_text(path, "old")
+
+    def half() -> None:
+        with files.whole_file(path) as scratch:
+            scratch.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        half()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    files.write_text(path, "new\n")
+    assert path.read_bytes() == b"new\n"
+
+
+def test_json_is_read_back_and_damage_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    files.write_json(path, {"가": [1, 2.5, None]}, durable=True)
+    assert files.read_json(path) == {"가": [1, 2.5, None]}
+    path.write_text("{")
+    assert files.read_json(path) is None
+    assert files.read_json(tmp_path / "gone.json") is None
+
+
+def test_a_folder_comes_whole_or_the_old_one_stays(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+    with files.whole_folder(out) as scratch:
+        (scratch / "a").write_text("1")
+
+    def half() -> None:
+        with files.whole_folder(out) as scratch:
+            (scratch / "b").write_text("2")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        half()
+    assert [p.name for p in out.iterdir()] == ["a"]
+    with files.whole_folder(out) as scratch:
+        (scratch / "b").write_text("2")
+    assert [p.name for p in out.iterdir()] == ["b"]
+    assert [p.name for p in out.parent.iterdir()] == ["out"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes are POSIX's")
+def test_folders_have_the_mode_that_the_umask_asks_for(tmp_path: Path) -> None:
+    # In a process of its own: the umask belongs to the whole process.
+    code = f"""
+import os, pathlib
+from brmgeo import files
+os.umask(0o077)
+with files.whole_folder(pathlib.Path({str(tmp_path / "out")!r})) as scratch:
+    files.write_text(scratch / "a", "x")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[1])
+    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == 0o700
+    assert stat.S_IMODE((tmp_path / "out" / "a").stat().st_mode) == 0o600
+
+
+def test_words_of_the_disk() -> None:
+    assert "disk is full" in str(files.reason(OSError(errno.ENOSPC, "x")))
+    assert files.reason(OSError(errno.ECHILD, "x")) is None
+
+
+def test_digest_and_copy(tmp_path: Path) -> None:
+    source = tmp_path / "a"
+    source.write_bytes(b"abc" * 100_000)
+    files.copy(source, tmp_path / "b")
+    wanted = hashlib.sha256(b"abc" * 100_000).hexdigest()
+    assert files.digest(tmp_path / "b") == files.digest_of(b"abc" * 100_000) == wanted
+    with pytest.raises(FileExistsError):
+        files.copy(source, tmp_path / "b")
+
+
+def test_a_lock_is_held_against_another_process(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    held = files.open_lock(path)
+    assert files.take_lock(held, wait=False)
+    code = f"""
+import pathlib
+from brmgeo import files
+d = files.open_lock(pathlib.Path({str(path)!r}))
+print(files.take_lock(d, wait=False))
+"""
+    run = [sys.executable, "-c", code]
+    root = Path(__file__).resolve().parents[1]
+    assert subprocess.run(run, capture_output=True, text=True, cwd=root).stdout.strip() == "False"
+    os.close(held)
+    assert subprocess.run(run, capture_output=True, text=True, cwd=root).stdout.strip() == "True"
