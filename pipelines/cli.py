@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 import tempfile
@@ -13,7 +12,7 @@ from typing import Any
 
 import click
 
-from brmgeo import __version__
+from brmgeo import __version__, files
 from brmgeo.errors import BrmgeoError, SettingsError
 
 DATA = click.Path(file_okay=False, path_type=Path)
@@ -69,7 +68,34 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+class _Command(click.Command):
+    """A command that says which of its options mends an error whose ``needs`` names a parameter."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """As click's own, with the option named in the message."""
+        try:
+            return super().invoke(ctx)
+        except BrmgeoError as error:
+            option = next((o for p in self.params if (o := _shown(p, ctx)) and p.name == error.needs), None)
+            if option is not None:
+                error.args = (f"{error} ({option})",)
+                error.needs = None
+            raise
+
+
+def _shown(param: click.Parameter, ctx: click.Context) -> str | None:
+    """An option as it is typed, ``--crs TEXT``; None for what is no option."""
+    if not isinstance(param, click.Option):
+        return None
+    value = "" if param.is_flag else f" {param.make_metavar(ctx)}"
+    return f"{param.opts[0]}{value}"
+
+
+class _Group(click.Group):
+    command_class = _Command
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="brmgeo")
 def cli() -> None:
     """Tell a drone where it is, without GNSS, from free building maps."""
@@ -927,9 +953,7 @@ def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, writ
                 f"inspect --write {write}: there is no folder {write.parent}; make it or choose another"
             )
         text, unread = job.inspect_document(paths, options)
-        part = write.with_name(f".{write.name}.part")
-        part.write_text(text, encoding="utf-8")
-        part.replace(write)
+        files.write_text(write, text)
         click.echo(f"wrote {write}")
     for path in paths if write is None else ():
         try:
@@ -975,19 +999,6 @@ def main() -> None:
     sys.exit(run(lambda: cli(standalone_mode=False)))
 
 
-#: What is wrong with a place, not with the program, and what to do about it.
-_PLACES = (
-    dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room or choose another place")
-    | dict.fromkeys(
-        (errno.EACCES, errno.EPERM, errno.EROFS), "give yourself the right to, or choose another place"
-    )
-    | dict.fromkeys(
-        (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOENT, errno.ENAMETOOLONG),
-        "check the path, or choose another",
-    )
-)
-
-
 def run(command: Callable[[], Any]) -> int:
     """Exit status of a command: 0, 2 for a known error (one line on stderr), 130 when interrupted."""
     try:
@@ -1014,12 +1025,11 @@ def run(command: Callable[[], Any]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
-        if error.errno not in _PLACES:
+        told = files.reason(error)
+        if told is None:
             raise
-        name = error.filename2 or error.filename or "a file"
-        click.echo(
-            f"brmgeo: {name} cannot be read or written: {error.strerror}; {_PLACES[error.errno]}", err=True
-        )
+        name = os.fsdecode(error.filename2 or error.filename or "a file")
+        click.echo(f"brmgeo: {name} cannot be read or written: {told}", err=True)
         return 2
     return 0
 

@@ -1,0 +1,73 @@
+"""The command line: what the library needs is said as an option, and what a disk says in words."""
+
+from __future__ import annotations
+
+import ast
+import errno
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+
+from brmgeo.errors import InputError
+from pipelines.cli import _Command, cli, run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _command(raises: Callable[[], object]) -> click.Command:
+    option = click.Option(["--source-crs", "source_crs"], help="CRS of the file.")
+    return _Command("read", params=[option], callback=lambda source_crs: raises())
+
+
+def _fail(error: Exception) -> Callable[[], object]:
+    def raises() -> object:
+        raise error
+
+    return raises
+
+
+def _told(capsys: pytest.CaptureFixture[str], raises: Callable[[], object]) -> str:
+    assert run(lambda: _command(raises).main([], standalone_mode=False)) == 2
+    return capsys.readouterr().err
+
+
+def test_what_is_needed_is_named_as_the_option(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, _fail(InputError("a.dxf: states no CRS: give it", needs="source_crs")))
+    assert told == "brmgeo: a.dxf: states no CRS: give it (--source-crs TEXT)\n"
+
+
+def test_a_need_that_this_command_has_no_option_for_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _told(capsys, _fail(InputError("a.dxf: odd", needs="levels"))) == "brmgeo: a.dxf: odd\n"
+
+
+def test_a_full_disk_is_a_line_with_the_place(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, _fail(OSError(errno.ENOSPC, "No space left on device", "/mnt/a.tif")))
+    assert told.startswith("brmgeo: /mnt/a.tif cannot be read or written: the disk is full")
+
+
+def test_every_need_of_the_library_is_a_parameter_of_some_command() -> None:
+    known = {param.name for command in cli.commands.values() for param in command.params}
+    found = {}
+    for path in sorted((ROOT / "brmgeo").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.keyword) and node.arg == "needs" and isinstance(node.value, ast.Constant):
+                found[node.value.value] = path
+    assert {need: path for need, path in found.items() if need not in known} == {}
+
+
+def test_the_library_names_no_option_and_no_command() -> None:
+    """What to type is said by the command line alone: the library is also called by programs."""
+    named = []
+    for path in sorted((ROOT / "brmgeo").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Raise) or node.exc is None:
+                continue
+            for text in ast.walk(node.exc):
+                if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                    words = text.value
+                    if any(mark in words for mark in (" --", "(--", "`brmgeo", "`make ", "(make ", "'--")):
+                        named.append(f"{path.relative_to(ROOT)}:{text.lineno}: {words}")
+    assert named == []
