@@ -572,8 +572,8 @@ def localize(
     looks: int | None,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
+    from brmgeo.locate.masks import NetworkUse
     from pipelines import flights as job
-    from pipelines.masks import NetworkUse
     from pipelines.regions import note_flown
 
     own, folder, attribution = job.maps_for("localize", region, maps_dir, data, scheduler)

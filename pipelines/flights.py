@@ -35,25 +35,13 @@ from brmgeo.evaluate.sift import SiftFix, SiftMatcher
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
 from brmgeo.export.cog import box_of, read_overview, read_window
 from brmgeo.flight.folder import Flight, read_flight
-from brmgeo.flight.motion import RESET_SPEED_M_S, motions
 from brmgeo.flight.readings import Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
 from brmgeo.geo.grid import bounds_of, gsd_of
-from brmgeo.match import (
-    METHODS,
-    GroundMap,
-    MatchSettings,
-    OdometrySettings,
-    PaperSettings,
-    SmoothedPath,
-    make_matcher,
-)
-from brmgeo.region import FlightSettings, Region
-from brmgeo.workflow.progress import Progress
-from brmgeo.workflow.schedule import scheduler, serial_map
-from pipelines.maps import NativeImagery, native_imagery
-from pipelines.masks import (
+from brmgeo.locate.live import Located, locate, motions_of, view_at
+from brmgeo.locate.maps import Maps, match_settings, read_maps
+from brmgeo.locate.masks import (
     ROOF_M,
     FrameMasks,
     NetworkUse,
@@ -62,9 +50,14 @@ from pipelines.masks import (
     network_mask,
     network_name,
     network_warning,
-    photographed,
     slant_gsd_m,
 )
+from brmgeo.match import METHODS, GroundMap, MatchSettings, SmoothedPath
+from brmgeo.region import FlightSettings, Region
+from brmgeo.workflow.progress import Progress
+from brmgeo.workflow.schedule import scheduler, serial_map
+from pipelines.maps import NativeImagery, native_imagery
+from pipelines.masks import photographed
 from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named, town_style
 
@@ -73,106 +66,7 @@ SIMULATED_NOTE = "# Simulated by brmgeo"
 PATHS = ("rectangle", "lawnmower", "random")
 
 
-# --- the maps that a flight is matched to ----------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Maps:
-    """A folder of built maps: the matcher's ground, its CRS, and where imagery and footprints are (None when absent)."""
-
-    folder: Path
-    ground: GroundMap
-    crs: str
-    imagery: Path | None
-    footprints: Path | None
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """(left, bottom, right, top) of the map, metres."""
-        rows, cols = self.ground.building.shape
-        g = self.ground
-        return (g.left, g.top - rows * g.gsd_m, g.left + cols * g.gsd_m, g.top)
-
-
-def read_maps(folder: Path) -> Maps:
-    """The maps in a folder; MissingInputError where buildings.tif or ratio.tif is not there."""
-    for name in ("buildings.tif", "ratio.tif"):
-        if not (folder / name).is_file():
-            raise MissingInputError(
-                f"{folder / name} is not there; build the maps first (make maps REGION=..., or brmgeo maps)"
-            )
-    return _read_maps(folder, (folder / "buildings.tif").stat().st_mtime_ns)
-
-
-@functools.lru_cache(maxsize=2)
-def _read_maps(folder: Path, changed_ns: int) -> Maps:
-    # The time of the last change is in the key, so that maps built anew are read anew.
-    path = folder / "buildings.tif"
-    box = box_of(path)
-    left, _, _, top = bounds_of(box)
-    ground = GroundMap(read_window(path)[0], left, top, gsd_of(box))
-    imagery, footprints = folder / "imagery.tif", folder / "footprints.gpkg"
-    return Maps(
-        folder,
-        ground,
-        str(box.crs),
-        imagery if imagery.is_file() else None,
-        footprints if footprints.is_file() else None,
-    )
-
-
-def match_settings(flight: FlightSettings) -> MatchSettings:
-    """The matchers' settings for a region: the paper's constants and the greatest speed are the region's own."""
-    return MatchSettings(
-        odometry=OdometrySettings(max_speed_m_s=flight.max_speed_m_s),
-        paper=PaperSettings(radii=flight.rings, e1=flight.e1, eps_m=flight.eps_m, d_max_m=flight.d_max_m),
-    )
-
-
 # --- one flight ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Located:
-    """What a matcher said of one flight; ``seconds`` (n,) is what each step took."""
-
-    estimates: list[Estimate]
-    smoothed: SmoothedPath
-    seconds: FloatArray
-
-
-def locate(
-    ground: GroundMap,
-    views: Iterator[View] | Sequence[View],
-    steps: Sequence[Motion],
-    method: str,
-    settings: MatchSettings,
-) -> Located:
-    """Runs a matcher over a flight's views, live, and smooths at the end."""
-    matcher = make_matcher(method, ground, settings)
-    estimates, seconds = [], []
-    for view, motion in zip(views, steps, strict=True):
-        start = time.perf_counter()
-        estimate = matcher.step(view, motion)
-        seconds.append(time.perf_counter() - start)
-        estimates.append(estimate)
-    return Located(estimates, matcher.smooth(), np.array(seconds))
-
-
-def view_at(flight: Flight, gsd_m: float, index: int, masks: FrameMasks | None = None) -> View:
-    """The levelled view of one frame's mask, of the flight's own where no others are given."""
-    frame = flight.frames[index]
-    return make_view(
-        flight.mask(index) if masks is None else masks.image(index),
-        flight.camera,
-        flight.mount,
-        frame.roll_rad,
-        frame.pitch_rad,
-        frame.agl_m if masks is None else masks.agl_m(index),
-        gsd_m,
-        t_s=frame.t_s,
-        file=frame.file,
-    )
 
 
 def localize(
@@ -247,21 +141,6 @@ def localize(
 def _middle(maps: Maps) -> tuple[float, float]:
     left, bottom, right, top = maps.bounds
     return (left + right) / 2, (bottom + top) / 2
-
-
-def motions_of(
-    flight: Flight, compass_yaw_rad: list[float | None] | None = None, max_speed_m_s: float = RESET_SPEED_M_S
-) -> list[Motion]:
-    """The flight's motions, with what a trusted compass says of each frame.
-
-    Odometry that moves faster than ``max_speed_m_s``, and than ``RESET_SPEED_M_S``, was reset there.
-    """
-    return motions(
-        flight.odometry,
-        flight.times_s,
-        compass_yaw_rad=compass_yaw_rad,
-        max_speed_m_s=max(RESET_SPEED_M_S, max_speed_m_s),
-    )
 
 
 def _source_of(flight: Flight) -> str:

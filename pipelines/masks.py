@@ -1,23 +1,15 @@
-"""Masks from pictures: a flight's frames, folders of images and whole rasters through the network.
-
-What the network said of a frame is kept by content (the frame's bytes, the weights, the settings), so a second run over
-the same frames asks it nothing, and a frame, weights or a height that changed is asked anew.
-"""
+"""Masks from pictures: a flight's frames, folders of images and whole rasters through the network."""
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import json
 import math
-import os
-import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,13 +23,14 @@ from pyproj import Geod
 from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-from brmgeo.errors import FlightError, InputError, MissingInputError, SettingsError
+from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.export.cog import write_cog
-from brmgeo.flight.camera import level_from_camera
-from brmgeo.flight.folder import Flight, read_flight
-from brmgeo.flight.readings import Attitude, Camera
+from brmgeo.files import write_bytes
+from brmgeo.flight.folder import read_flight
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.geo.grid import Window
+from brmgeo.locate.masks import Answer, frame_gsd_m, frame_picture, stored_of
+from brmgeo.pictures import encode
 from brmgeo.segment.predict import (
     OVERLAP_PX,
     WINDOW_PX,
@@ -50,167 +43,11 @@ from brmgeo.segment.predict import (
     scaled_levels,
     spans,
 )
-from brmgeo.segment.weights import ModelCard
 from brmgeo.workflow.progress import Bar, Progress
 
-Answer = Literal["mask", "probability"]
-#: Probabilities on disk: 0 to 254 for 0 to 1, 255 for unknown.
-STEPS, UNKNOWN = 254, 255
-#: A network finds roofs, and a roof is seen where its height puts it: its masks are laid onto a plane this high above ground
-#: (one storey), not onto the ground. Sheffield's frames then register 0.7 m nearer to the reference.
-ROOF_M = 3.0
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 SIGN = "masks.json"
-_FORMAT = 1  # of the cache's files and key
 _BLOCK_PX = 512
-#: Frames that go through the network together, and the pixels after which no further one is added.
-_BATCH, _BATCH_PX = 4, 4_000_000
-
-
-# --- frames of a flight ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class FrameMasks:
-    """What is building in each frame of a flight, and where that is from.
-
-    Attributes:
-        flight: the flight.
-        source: for reports: the flight's own masks, or the network and its weights.
-        files: the network's probability of each frame; None for the flight's own masks.
-        threshold: probabilities above it are building; None hands probabilities on as they are.
-        roof_m: what the masks show as building stands this high above ground; 0 for outlines on the ground.
-    """
-
-    flight: Flight
-    source: str
-    files: tuple[Path, ...] | None = None
-    threshold: float | None = None
-    roof_m: float = 0.0
-
-    def agl_m(self, index: int) -> float:
-        """Height of a frame above what its mask shows, metres."""
-        return above_roofs_m(self.flight.frames[index].agl_m, self.roof_m)
-
-    def image(self, index: int) -> NDArray[Any]:
-        """(height, width) of one frame: uint8 0 or 255, or float32 probability with NaN where unknown."""
-        if self.files is None:
-            return self.flight.mask(index)
-        stored = _read_stored(self.files[index])
-        if stored is None:
-            raise InputError(f"{self.files[index]}: a mask that was kept is damaged or gone: run again")
-        probability = _probability(stored)
-        return probability if self.threshold is None else mask_of(probability, self.threshold)
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkUse:
-    """How the network is to be used on frames.
-
-    Attributes:
-        wanted: ``given`` masks where the flight has them, else the network; or the ``network`` in any case.
-        weights: their file; None for those that ship with brmgeo. A file means the network in any case.
-        answer: hand the matcher masks or probabilities. Masks are the better evidence: a frame's fit to the map tells
-            right from wrong two to four times as clearly as with probabilities, and lies as near to the truth.
-        cache: folder in which answers are kept; None keeps none beyond the run.
-        roof_m: height above ground of the roofs it finds.
-        looks: how often it looks at a frame; None: as the weights' card says.
-    """
-
-    wanted: Literal["given", "network"] = "given"
-    weights: Path | None = None
-    answer: Answer = "mask"
-    cache: Path | None = None
-    roof_m: float = ROOF_M
-    looks: int | None = None
-
-    def asks_network(self, flight: Flight) -> bool:
-        """True where the network is to make the masks of a flight."""
-        return self.wanted == "network" or self.weights is not None or not flight.has_masks
-
-
-@contextmanager
-def frame_masks(
-    flight: Flight, given: str, use: NetworkUse, progress: Progress, region: str = ""
-) -> Iterator[FrameMasks]:
-    """The masks of a flight's frames, for as long as the block lasts; the network runs on frames not seen before.
-
-    Args:
-        given: what reports call masks of the flight folder.
-        region: whose maps the flight is matched with; where the network was trained on it, that is said.
-
-    Raises InputError for frames that are damaged or of another size, MissingInputError without weights or frames.
-    """
-    if not use.asks_network(flight):
-        yield FrameMasks(flight, given)
-        return
-    if not flight.has_images:
-        raise MissingInputError(
-            f"{flight.folder}: the network is to make masks, but the flight has no frames; put them into frames/"
-        )
-    segmenter = Segmenter.load(use.weights, looks=use.looks)
-    if warning := trained_over(segmenter.card, region):
-        progress.say(f"{flight.name}: {warning}")
-    with tempfile.TemporaryDirectory(prefix="brmgeo-masks-") as scratch:
-        files = _ask(flight, segmenter, use.cache or Path(scratch), progress)
-        threshold = segmenter.card.threshold if use.answer == "mask" else None
-        runs = {"onnx": "ONNX Runtime", "torch": "torch"}[segmenter.backend]
-        shown = "probabilities" if threshold is None else f"masks above {threshold:g}"
-        source = f"network {segmenter.name} ({runs}), {shown}, roofs at {use.roof_m:g} m"
-        yield FrameMasks(flight, source, files, threshold, use.roof_m)
-
-
-def above_roofs_m(agl_m: float, roof_m: float) -> float:
-    """Height above roofs of a camera ``agl_m`` above ground; at least half of that."""
-    return max(agl_m - roof_m, agl_m / 2.0)
-
-
-@functools.lru_cache(maxsize=2)
-def _segmenter(weights: Path | None, looks: int | None = None) -> Segmenter:
-    return Segmenter.load(weights, threads=1, looks=looks)
-
-
-def trained_over(card: ModelCard, region: str) -> str:
-    """What is to be said where a network was trained on the region that it is used over; empty where it was not."""
-    named = set(_trained_regions(card.data))
-    if region not in named:
-        return ""
-    return f"the network was trained on region {region}, so results over it look better than elsewhere"
-
-
-def _trained_regions(data: Any) -> Iterator[str]:
-    """Regions among the sources of a card's data that were not for tests, and of the weights that it went on from."""
-    sources = data.get("sources") if isinstance(data, dict) else None
-    for source in sources if isinstance(sources, list) else ():
-        if isinstance(source, dict) and source.get("split") != "test":
-            regions = source.get("regions")
-            yield from (
-                r for r in (regions if isinstance(regions, list | tuple) else ()) if isinstance(r, str)
-            )
-            yield from _trained_regions(source.get("data"))
-
-
-def network_warning(weights: Path | None, region: str) -> str:
-    """``trained_over`` of the network of these weights; raises as ``Segmenter.load``."""
-    return trained_over(_segmenter(weights).card, region)
-
-
-def network_name(weights: Path | None, looks: int | None = None) -> str:
-    """What reports call the network of these weights; raises as ``Segmenter.load``."""
-    return f"network {_segmenter(weights, looks).name}"
-
-
-def network_mask(
-    picture: NDArray[np.uint8], gsd_m: float, weights: Path | None, looks: int | None = None
-) -> NDArray[Any]:
-    """What ``FrameMasks`` would hand on of a (h, w, 3) RGB frame, on one processor thread, kept nowhere."""
-    segmenter = _segmenter(weights, looks)
-    probability = _probability(_stored(segmenter.probability(picture, gsd_m)))
-    return (
-        probability
-        if NetworkUse().answer == "probability"
-        else mask_of(probability, segmenter.card.threshold)
-    )
 
 
 def photographed(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
@@ -220,111 +57,6 @@ def photographed(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     seen = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert seen is not None
     return np.ascontiguousarray(seen[:, :, ::-1]).astype(np.uint8, copy=False)
-
-
-def slant_gsd_m(camera: Camera, mount: Attitude, roll_rad: float, pitch_rad: float, agl_m: float) -> float:
-    """Metres per pixel at the middle of a frame: height over focal length, along the camera's slant."""
-    axis = level_from_camera(mount, roll_rad, pitch_rad)[:, 2]
-    return float(agl_m / math.sqrt(camera.fx * camera.fy) / max(-axis[2], 0.25))
-
-
-def frame_gsd_m(flight: Flight, index: int) -> float:
-    """Metres per pixel at the middle of a flight's frame."""
-    frame = flight.frames[index]
-    return slant_gsd_m(flight.camera, flight.mount, frame.roll_rad, frame.pitch_rad, frame.agl_m)
-
-
-def frame_picture(flight: Flight, index: int) -> tuple[Picture, bytes]:
-    """A frame as a picture, and the bytes that it is known by; FlightError where its size is not the camera's."""
-    path = flight.folder / "frames" / flight.frames[index].file
-    if path.is_file():
-        data = path.read_bytes()
-        picture = read_image(path, data)
-    else:  # a frame of a video
-        image = flight.image(index)
-        picture, data = picture_of(image, flight.frames[index].file), image.tobytes()
-    camera = flight.camera
-    if picture.rgb.shape[:2] != (camera.height, camera.width):
-        raise FlightError(
-            f"{path}: {picture.rgb.shape[1]} x {picture.rgb.shape[0]} px, but [camera] in flight.toml says "
-            f"{camera.width} x {camera.height}"
-        )
-    return picture, data
-
-
-def _ask(flight: Flight, segmenter: Segmenter, cache: Path, progress: Progress) -> tuple[Path, ...]:
-    """The file of each frame's probability, after the network has answered for those that are not there yet."""
-    files: list[Path] = []
-    waiting: list[tuple[Path, Picture, float]] = []
-    asked = 0
-
-    def answer() -> None:
-        said = segmenter.probabilities([p for _, p, _ in waiting], [g for _, _, g in waiting])
-        for (path, _, _), probability in zip(waiting, said, strict=True):
-            _write_png(path, _stored(probability))
-        waiting.clear()
-
-    with progress.stage(f"{flight.name} masks") as bar:
-        for index in range(len(flight.frames)):
-            picture, data = frame_picture(flight, index)
-            gsd_m = frame_gsd_m(flight, index)
-            path = cache / _key(data, segmenter, picture, gsd_m)
-            stored = _read_stored(path)
-            if stored is None or stored.shape != picture.rgb.shape[:2]:
-                waiting.append((path, picture, gsd_m))
-                asked += 1
-            files.append(path)
-            pixels = sum(p.rgb.shape[0] * p.rgb.shape[1] for _, p, _ in waiting)
-            if len(waiting) == _BATCH or pixels > _BATCH_PX or index + 1 == len(flight.frames):
-                answer()
-            bar.update(index + 1, len(flight.frames))
-    kept = len(files) - asked
-    if kept:
-        progress.say(f"{flight.name} masks: {kept} of {len(files)} frames were known from an earlier run")
-    return tuple(files)
-
-
-def _key(data: bytes, segmenter: Segmenter, picture: Picture, gsd_m: float) -> Path:
-    size = segmenter.working_size((picture.rgb.shape[0], picture.rgb.shape[1]), gsd_m)
-    settings = {
-        "format": _FORMAT,
-        "weights": segmenter.card.sha256,
-        "backend": segmenter.backend,
-        "looks": segmenter.looks,
-    }
-    text = json.dumps({**settings, "frame": hashlib.sha256(data).hexdigest(), "size": size}, sort_keys=True)
-    key = hashlib.sha256(text.encode()).hexdigest()
-    return Path(key[:2]) / f"{key[2:40]}.png"
-
-
-def _stored(probability: NDArray[np.float32]) -> NDArray[np.uint8]:
-    known = np.isfinite(probability)
-    steps = np.rint(np.where(known, probability, 0.0) * STEPS)
-    return np.where(known, steps, UNKNOWN).astype(np.uint8)
-
-
-def _probability(stored: NDArray[np.uint8]) -> NDArray[np.float32]:
-    out = stored.astype(np.float32) / np.float32(STEPS)
-    out[stored == UNKNOWN] = np.nan
-    return out
-
-
-def _read_stored(path: Path) -> NDArray[np.uint8] | None:
-    if not path.is_file():
-        return None
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    return (
-        None if image is None or image.ndim != 2 or image.dtype != np.uint8 else np.asarray(image, np.uint8)
-    )
-
-
-def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    ok, data = cv2.imencode(".png", image)
-    assert ok
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_bytes(data.tobytes())
-    part.replace(path)
 
 
 # --- folders of images -------------------------------------------------------------------------------------------
@@ -440,7 +172,7 @@ def _segment_pictures(
         for done, (job, name) in enumerate(zip(jobs, names, strict=True), start=1):
             probability = segmenter.probability(job.picture(), job.gsd_m)
             mask = mask_of(probability, segmenter.card.threshold)
-            _write_png(out / name, mask if answer == "mask" else _stored(probability))
+            write_bytes(out / name, encode(mask if answer == "mask" else stored_of(probability)))
             share += float((mask > 0).mean()) / len(jobs)
             bar.update(done, len(jobs))
     _write_facts(out, {**facts, "finished": True, "building_share": round(share, 6)})

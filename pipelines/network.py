@@ -41,6 +41,7 @@ from brmgeo.flight.camera import world_from_camera
 from brmgeo.flight.folder import read_flight
 from brmgeo.flight.view import lowered
 from brmgeo.geo.grid import lattice
+from brmgeo.locate.masks import frame_gsd_m
 from brmgeo.maps.rasterize import building_mask
 from brmgeo.region import describe_fault, load_region
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, shrunk
@@ -52,7 +53,6 @@ from brmgeo.synth.day import another_day
 from brmgeo.synth.imagery import render_imagery
 from brmgeo.synth.scene import Season, TownStyle
 from brmgeo.synth.town import generate_town
-from pipelines.masks import frame_gsd_m
 
 T = TypeVar("T")
 F32 = NDArray[np.float32]

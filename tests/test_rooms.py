@@ -70,6 +70,7 @@ MAY_KNOW = {
     "brmgeo.evaluate": VALUES,
     "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
     "brmgeo.segment": VALUES | {"brmgeo.maps"},
+    "brmgeo.locate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.segment", "brmgeo.export.cog"},
     "brmgeo.workflow": FOUNDATION | {"brmgeo"},
 }
 # Libraries that live in one room only.

@@ -17,8 +17,8 @@ from brmgeo.errors import FlightError
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.readings import Odometry
 from brmgeo.geo.crs import transformer
+from brmgeo.locate.live import motions_of
 from pipelines import cli, odometry
-from pipelines.flights import motions_of
 
 TOML = """name = "small"
 [camera]

@@ -22,9 +22,13 @@ from affine import Affine
 from pyproj import Transformer
 
 from brmgeo.errors import SettingsError
+from brmgeo.flight.folder import read_flight
+from brmgeo.locate.live import locate, motions_of, view_at
+from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.match import METHODS, GroundMap, make_matcher
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
+from brmgeo.region import FlightSettings
 from pipelines import flights as job
 from pipelines.cli import cli, run
 
@@ -176,7 +180,7 @@ def test_result_files_agree_with_each_other(whole: Path, results: Path, method: 
         "mass",
     ]
     assert list(rows[0]) == head
-    frames = job.read_flight(whole).frames
+    frames = read_flight(whole).frames
     assert [r["file"] for r in rows] == [f.file for f in frames]
     assert {r["status"] for r in rows} <= {"converged", "ambiguous", "lost"}
     for row in rows:
@@ -196,7 +200,7 @@ def test_result_files_agree_with_each_other(whole: Path, results: Path, method: 
     assert metrics["method"] == method
     assert metrics["data"] == "simulated"
     assert metrics["seconds_per_frame"] > 0
-    reference = job.read_flight(whole).reference(CRS)
+    reference = read_flight(whole).reference(CRS)
     assert reference is not None
     truth = {f.file: reference.at(np.array([f.t_s]))[0] for f in frames}
     errors = np.array([math.dist((float(r["x"]), float(r["y"])), truth[r["file"]]) for r in fixed])
@@ -274,11 +278,11 @@ def test_live_matcher_and_folder_run_say_the_same(
     maps: Path, whole: Path, results: Path, method: str
 ) -> None:
     rows = list(csv.DictReader((results / method / "fixes.csv").read_text().splitlines()))
-    ground = job.read_maps(maps).ground
-    flight = job.read_flight(whole)
-    matcher = make_matcher(method, ground, job.match_settings(job.FlightSettings()))
-    for i, (motion, row) in enumerate(zip(job.motions_of(flight), rows, strict=True)):
-        estimate = matcher.step(job.view_at(flight, ground.gsd_m, i), motion)
+    ground = read_maps(maps).ground
+    flight = read_flight(whole)
+    matcher = make_matcher(method, ground, match_settings(FlightSettings()))
+    for i, (motion, row) in enumerate(zip(motions_of(flight), rows, strict=True)):
+        estimate = matcher.step(view_at(flight, ground.gsd_m, i), motion)
         assert estimate.status == row["status"]
         assert estimate.candidate_count == int(row["candidates"])
         if estimate.position is not None:
@@ -327,10 +331,10 @@ def without_odometry(flight: Path) -> None:
 
 
 def statuses(ground: GroundMap, flight_dir: Path, method: str) -> set[str]:
-    flight = job.read_flight(flight_dir)
-    views = [job.view_at(flight, ground.gsd_m, i) for i in range(len(flight.frames))]
-    settings = job.match_settings(job.FlightSettings())
-    located = job.locate(ground, views, job.motions_of(flight), method, settings)
+    flight = read_flight(flight_dir)
+    views = [view_at(flight, ground.gsd_m, i) for i in range(len(flight.frames))]
+    settings = match_settings(FlightSettings())
+    located = locate(ground, views, motions_of(flight), method, settings)
     return {e.status for e in located.estimates}
 
 
@@ -350,7 +354,7 @@ def test_without_odometry_nothing_false_is_said(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_flight_over_another_town_has_no_fix(maps: Path, whole: Path, method: str) -> None:
-    ground = job.read_maps(maps).ground
+    ground = read_maps(maps).ground
     # Mirrored, the town is as built up as before but nowhere alike.
     other = replace(ground, building=np.ascontiguousarray(ground.building[:, ::-1]))
     assert "converged" not in statuses(other, whole, method)
@@ -363,7 +367,7 @@ def test_a_single_frame_is_a_flight(
     said = say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "out")
     assert said.code == 0, said.err
     assert len((tmp_path / "out/fixes.csv").read_text().splitlines()) == 2
-    ground = job.read_maps(maps).ground
+    ground = read_maps(maps).ground
     for method in METHODS:
         assert len(statuses(ground, flight, method)) == 1
 
@@ -563,7 +567,7 @@ def test_the_flight_that_localize_makes_has_a_name_of_its_own(
 
     monkeypatch.setattr(job, "simulate_flight", simulate)
     monkeypatch.setattr(job, "native_imagery", lambda *_: None)
-    region = job.Region.model_construct(name="r", flight=job.FlightSettings(), imagery=None)
+    region = job.Region.model_construct(name="r", flight=FlightSettings(), imagery=None)
     assert job.default_flight(region, maps, tmp_path, 1) == made[0][0]
     # brmgeo simulate calls its own flights simulated-SEED.
     assert [name for _, name in made] == ["default-1"] == [made[0][0].name]
@@ -618,12 +622,12 @@ def test_simulate_gives_the_same_bytes_and_counts_seeds(
     assert bytes_of(tmp_path / "four") != bytes_of(tmp_path / "many/simulated-3")
     assert say(*words, "--no-odometry", "--mode", "masks", "--out", tmp_path / "none").code == 0
     assert not (tmp_path / "none/odometry.tum").exists()
-    assert job.read_flight(tmp_path / "none").odometry is None
+    assert read_flight(tmp_path / "none").odometry is None
 
 
 @pytest.mark.parametrize("path", job.PATHS)
 def test_named_paths_stay_on_the_map(maps: Path, path: str) -> None:
-    built = job.read_maps(maps)
+    built = read_maps(maps)
     assert built.footprints is not None
     for seed in range(3):
         try:
@@ -692,7 +696,7 @@ def test_evaluate_writes_the_table_and_compares_results(
 
 
 def test_hidden_half_of_the_map_is_never_found(maps: Path, tmp_path: Path) -> None:
-    built = job.read_maps(maps)
+    built = read_maps(maps)
     for side in ("east", "west", "north", "south"):
         kept, (left, bottom, right, top) = job._half_hidden(built, side)
         rows, cols = kept.building.shape
@@ -721,18 +725,18 @@ def real_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def registered(maps_dir: Path, pitch_off_deg: float) -> tuple[np.ndarray, np.ndarray]:
     """(n,) metres between each frame registered from the reference and the reference, and (n,) log ratios."""
-    maps, flight = job.read_maps(maps_dir), job.read_flight(REAL)
+    maps, flight = read_maps(maps_dir), read_flight(REAL)
     reference = flight.reference(maps.crs)
     assert reference is not None
     truth = reference.at(flight.times_s)
     yaws = flight.compass_yaw_rad(maps.crs, *truth[0])
     mount = replace(flight.mount, pitch_rad=flight.mount.pitch_rad + math.radians(pitch_off_deg))
     flight = replace(flight, mount=mount)
-    settings = job.match_settings(job.FlightSettings())
+    settings = match_settings(FlightSettings())
     rates, registrar = RateLearner(settings.rates).rates, Registrar(maps.ground)
     apart, fits = [], []
     for i, (xy, yaw) in enumerate(zip(truth, yaws, strict=True)):
-        view = job.view_at(flight, maps.ground.gsd_m, i)
+        view = view_at(flight, maps.ground.gsd_m, i)
         if view.building.sum() * view.gsd_m**2 < 20.0:
             continue
         assert yaw is not None

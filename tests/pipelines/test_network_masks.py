@@ -24,14 +24,20 @@ import shapely
 from affine import Affine
 from rasterio.enums import ColorInterp
 
+from brmgeo.flight.folder import read_flight
 from brmgeo.flight.readings import Attitude
+from brmgeo.flight.view import make_view
+from brmgeo.locate import masks as locating
+from brmgeo.locate.live import view_at
+from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
+from brmgeo.region import FlightSettings
 from brmgeo.segment import predict
 from brmgeo.segment.predict import Segmenter
 from brmgeo.synth.flight import FlightSettings as Simulated
 from brmgeo.synth.flight import Ground, Simulator, fly
-from pipelines import flights
+from brmgeo.workflow.progress import Progress
 from pipelines import masks as job
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "segment"))
@@ -75,7 +81,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
 
 
 def frames_of(flight: Path) -> list[str]:
-    return [frame.file for frame in job.read_flight(flight).frames]
+    return [frame.file for frame in read_flight(flight).frames]
 
 
 def test_localize_runs_the_network_where_there_are_no_masks(
@@ -109,9 +115,9 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
 
     def ask(folder: Path, weights_file: Path, looks: int | None = None) -> list[bytes]:
         asked.clear()
-        flight = job.read_flight(folder)
-        use = job.NetworkUse(weights=weights_file, cache=cache, looks=looks)
-        with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
+        flight = read_flight(folder)
+        use = locating.NetworkUse(weights=weights_file, cache=cache, looks=looks)
+        with locating.frame_masks(flight, "", use, Progress(quiet=True)) as masks:
             return [masks.image(i).tobytes() for i in range(len(flight.frames))]
 
     first = ask(pictured, weights)
@@ -142,19 +148,19 @@ def test_the_network_is_asked_only_of_what_it_has_not_seen(
 
 
 @pytest.mark.parametrize("answer", ["mask", "probability"])
-def test_masks_are_what_the_network_says(pictured: Path, weights: Path, answer: job.Answer) -> None:
-    flight = job.read_flight(pictured)
+def test_masks_are_what_the_network_says(pictured: Path, weights: Path, answer: locating.Answer) -> None:
+    flight = read_flight(pictured)
     segmenter = Segmenter.load(weights)
-    use = job.NetworkUse(weights=weights, answer=answer)
-    with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
+    use = locating.NetworkUse(weights=weights, answer=answer)
+    with locating.frame_masks(flight, "", use, Progress(quiet=True)) as masks:
         image = masks.image(2)
-        wanted = segmenter.probability(flight.image(2), job.frame_gsd_m(flight, 2))
+        wanted = segmenter.probability(flight.image(2), locating.frame_gsd_m(flight, 2))
         if answer == "probability":
             assert image.dtype == np.float32
-            np.testing.assert_allclose(image, wanted, atol=0.5 / job.STEPS + 1e-6)
+            np.testing.assert_allclose(image, wanted, atol=0.5 / locating.STEPS + 1e-6)
         else:
             apart = (image > 0) != (wanted > 0.5)
-            assert (np.abs(wanted[apart] - 0.5) < 1 / job.STEPS).all()
+            assert (np.abs(wanted[apart] - 0.5) < 1 / locating.STEPS).all()
             assert set(np.unique(image)) == {0, 255}
         files = masks.files
     assert files is not None
@@ -165,14 +171,14 @@ def test_given_masks_are_used_unless_the_network_is_wanted(
     maps: Path, waypoints: Path, weights: Path, tmp_path: Path, say: Say, asked: list
 ) -> None:
     folder = make_flight(maps, waypoints, tmp_path / "f", "--mode", "both")
-    flight, quiet = job.read_flight(folder), job.Progress(quiet=True)
-    with job.frame_masks(flight, "as given", job.NetworkUse(), quiet) as masks:
+    flight, quiet = read_flight(folder), Progress(quiet=True)
+    with locating.frame_masks(flight, "as given", locating.NetworkUse(), quiet) as masks:
         assert masks.source == "as given"
         assert (masks.image(1) == flight.mask(1)).all()
     assert not asked
-    for use in (job.NetworkUse(weights=weights), job.NetworkUse(wanted="network", weights=weights)):
+    for use in (locating.NetworkUse(weights=weights), locating.NetworkUse(wanted="network", weights=weights)):
         asked.clear()
-        with job.frame_masks(flight, "as given", use, quiet) as masks:
+        with locating.frame_masks(flight, "as given", use, quiet) as masks:
             assert masks.source.startswith("network bright")
         assert len(asked) == len(flight.frames)
     shutil.rmtree(folder / "frames")
@@ -186,22 +192,22 @@ def test_a_network_over_ground_it_was_trained_on_is_told(
 ) -> None:
     sources = [{"name": "t", "regions": ["town-a"]}, {"name": "g", "split": "test", "regions": ["town-g"]}]
     own = bright_onnx(tmp_path / "own.onnx", small_card(data={"sources": sources}))
-    card = job.Segmenter.load(own, threads=1).card
-    assert job.trained_over(card, "town-g") == job.trained_over(card, "") == ""
-    assert "trained on region town-a" in job.network_warning(own, "town-a")
-    flight = job.read_flight(pictured)
-    with job.frame_masks(flight, "", job.NetworkUse(weights=own), job.Progress(), "town-a"):
+    card = Segmenter.load(own, threads=1).card
+    assert locating.trained_over(card, "town-g") == locating.trained_over(card, "") == ""
+    assert "trained on region town-a" in locating.network_warning(own, "town-a")
+    flight = read_flight(pictured)
+    with locating.frame_masks(flight, "", locating.NetworkUse(weights=own), Progress(), "town-a"):
         assert "trained on region town-a" in capsys.readouterr().err
     # What the weights that it went on from were trained on counts, however long ago.
     started = {"kind": "start", "data": {"sources": [{"kind": "start", "data": card.data}]}}
     later = small_card(data={"sources": [started, {"name": "others", "regions": ["town-x"]}]})
-    assert "trained on region town-a" in job.trained_over(later, "town-a")
-    assert job.trained_over(later, "town-g") == ""
+    assert "trained on region town-a" in locating.trained_over(later, "town-a")
+    assert locating.trained_over(later, "town-g") == ""
 
 
 @pytest.mark.parametrize("regions", [None, 5, [["demo"]], "demo"])
 def test_a_card_of_another_form_says_nothing(regions: object) -> None:
-    assert job.trained_over(small_card(data={"sources": [{"regions": regions}, "demo"]}), "demo") == ""
+    assert locating.trained_over(small_card(data={"sources": [{"regions": regions}, "demo"]}), "demo") == ""
 
 
 def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
@@ -219,9 +225,9 @@ def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
     pose = simulator.course
 
     def overlap(relief: bool, roof_m: float) -> float:
-        view = flights.make_view(
+        view = make_view(
             simulator.mask(1, relief), own.camera, own.mount, math.radians(pose.measured_roll_deg[1]),
-            math.radians(pose.measured_pitch_deg[1]), job.above_roofs_m(100.0, roof_m), 0.25,
+            math.radians(pose.measured_pitch_deg[1]), locating.above_roofs_m(100.0, roof_m), 0.25,
         )  # fmt: skip
         rows, cols = np.indices(view.building.shape) + 0.5
         ahead, left = (view.nadir_px[0] - rows) * 0.25, (view.nadir_px[1] - cols) * 0.25
@@ -236,7 +242,7 @@ def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
     assert overlap(False, 0.0) > 0.97
     assert overlap(True, 6.0) > 0.95
     assert overlap(True, 0.0) < 0.85
-    assert job.above_roofs_m(4.0, 3.0) == 2.0
+    assert locating.above_roofs_m(4.0, 3.0) == 2.0
 
 
 @pytest.mark.parametrize(
@@ -337,7 +343,7 @@ def test_segment_a_flight_and_a_folder(
 ) -> None:
     said = say("segment", pictured, "--out", tmp_path / "masks", "--weights", weights)
     assert said.code == 0, said.err
-    flight = job.read_flight(pictured)
+    flight = read_flight(pictured)
     facts = json.loads((tmp_path / "masks" / job.SIGN).read_text())
     assert facts["images"] == len(flight.frames)
     assert facts["finished"]
@@ -345,9 +351,9 @@ def test_segment_a_flight_and_a_folder(
     # They are masks by the letter of docs/FLIGHT.md.
     given = Path(shutil.copytree(pictured, tmp_path / "given"))
     shutil.copytree(tmp_path / "masks", given / "masks")
-    again = job.read_flight(given)
+    again = read_flight(given)
     segmenter = Segmenter.load(weights)
-    assert (again.mask(1) == segmenter.mask(flight.image(1), job.frame_gsd_m(flight, 1))).all()
+    assert (again.mask(1) == segmenter.mask(flight.image(1), locating.frame_gsd_m(flight, 1))).all()
 
     folder = tmp_path / "images"
     folder.mkdir()
@@ -591,21 +597,21 @@ def test_every_real_frame_registers_on_the_map_by_the_shipped_network(
     real_maps: Path, tmp_path: Path
 ) -> None:
     """The whole chain on a real flight that the network was never trained on: pictures, masks, registration."""
-    built, flight = flights.read_maps(real_maps), job.read_flight(REAL)
+    built, flight = read_maps(real_maps), read_flight(REAL)
     reference = flight.reference(built.crs)
     assert reference is not None
     truth = reference.at(flight.times_s)
     yaws = flight.compass_yaw_rad(built.crs, *truth[0])
-    rates = RateLearner(flights.match_settings(flights.FlightSettings()).rates).rates
+    rates = RateLearner(match_settings(FlightSettings()).rates).rates
     registrar = Registrar(built.ground)
-    use = job.NetworkUse(wanted="network", cache=tmp_path)
+    use = locating.NetworkUse(wanted="network", cache=tmp_path)
     apart = []
-    with job.frame_masks(flight, "", use, job.Progress(quiet=True)) as masks:
+    with locating.frame_masks(flight, "", use, Progress(quiet=True)) as masks:
         for i, (xy, yaw) in enumerate(zip(truth, yaws, strict=True)):
-            given = flights.view_at(flight, built.ground.gsd_m, i)
+            given = view_at(flight, built.ground.gsd_m, i)
             if given.building.sum() * given.gsd_m**2 < 20.0:
                 continue  # no roof in sight
-            view = flights.view_at(flight, built.ground.gsd_m, i, masks)
+            view = view_at(flight, built.ground.gsd_m, i, masks)
             assert yaw is not None
             found = registrar.register(view, np.array([*xy, yaw]), 10.0, 0.1, rates)
             apart.append(10.0 if found is None else math.dist(found.pose[:2], xy))

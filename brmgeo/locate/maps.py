@@ -1,0 +1,66 @@
+"""The maps that a flight is matched to, and the matchers' settings over them."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+from brmgeo.errors import MissingInputError
+from brmgeo.export.cog import box_of, read_window
+from brmgeo.geo.grid import bounds_of, gsd_of
+from brmgeo.match import GroundMap, MatchSettings, OdometrySettings, PaperSettings
+from brmgeo.region import FlightSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Maps:
+    """A folder of built maps: the matcher's ground, its CRS, and where imagery and footprints are (None when absent)."""
+
+    folder: Path
+    ground: GroundMap
+    crs: str
+    imagery: Path | None
+    footprints: Path | None
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """(left, bottom, right, top) of the map, metres."""
+        rows, cols = self.ground.building.shape
+        g = self.ground
+        return (g.left, g.top - rows * g.gsd_m, g.left + cols * g.gsd_m, g.top)
+
+
+def read_maps(folder: Path) -> Maps:
+    """The maps in a folder; MissingInputError where buildings.tif or ratio.tif is not there."""
+    for name in ("buildings.tif", "ratio.tif"):
+        if not (folder / name).is_file():
+            raise MissingInputError(
+                f"{folder / name} is not there; build the maps first (make maps REGION=..., or brmgeo maps)"
+            )
+    return _read_maps(folder, (folder / "buildings.tif").stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=2)
+def _read_maps(folder: Path, changed_ns: int) -> Maps:
+    # The time of the last change is in the key, so that maps built anew are read anew.
+    path = folder / "buildings.tif"
+    box = box_of(path)
+    left, _, _, top = bounds_of(box)
+    ground = GroundMap(read_window(path)[0], left, top, gsd_of(box))
+    imagery, footprints = folder / "imagery.tif", folder / "footprints.gpkg"
+    return Maps(
+        folder,
+        ground,
+        str(box.crs),
+        imagery if imagery.is_file() else None,
+        footprints if footprints.is_file() else None,
+    )
+
+
+def match_settings(flight: FlightSettings) -> MatchSettings:
+    """The matchers' settings for a region: the paper's constants and the greatest speed are the region's own."""
+    return MatchSettings(
+        odometry=OdometrySettings(max_speed_m_s=flight.max_speed_m_s),
+        paper=PaperSettings(radii=flight.rings, e1=flight.e1, eps_m=flight.eps_m, d_max_m=flight.d_max_m),
+    )
