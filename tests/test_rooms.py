@@ -48,6 +48,7 @@ ADAPTERS = {
     "brmgeo.flight.folder",
     "brmgeo.flight.logs",
     "brmgeo.flight.odometry",
+    "brmgeo.flight.poses",
     "brmgeo.flight.tables",
     "brmgeo.segment.shards",
 }
@@ -157,3 +158,58 @@ def test_libraries_stay_in_their_room(module: str) -> None:
         if library in top:
             assert any(inside(module, room) for room in rooms), f"{module} imports {library}"
     assert "pipelines" not in top or inside(module, "pipelines")
+
+
+def graph() -> dict[str, set[str]]:
+    """Every module and the modules that it imports, at its top or inside a function, by the names that it writes."""
+    known = modules()
+    found = {}
+    for module, path in known.items():
+        named = set[str]()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                named |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                assert not node.level, f"{module} imports by a relative name"
+                # ``from room import name`` is of the module ``room.name`` where there is one, else of the room's face.
+                for alias in node.names:
+                    inner = f"{node.module}.{alias.name}"
+                    named.add(inner if inner in known else node.module)
+        found[module] = {name for name in named if name in known and name != module}
+    return found
+
+
+def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
+    """The strongly connected components of more than one module, after Tarjan."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in sorted(arrows.get(node, ())):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            component = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(component) > 1:
+                found.append(sorted(component))
+
+    for node in sorted(arrows):
+        if node not in index:
+            visit(node)
+    return found
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    assert circles(graph()) == []
+
+
+def test_a_circle_would_be_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c", "d"}, "c": {"a"}, "d": set()}) == [["a", "b", "c"]]

@@ -15,12 +15,14 @@ from brmgeo.errors import FlightError
 from brmgeo.flight.readings import FloatArray
 
 
-def refuse(path: Path, line: int | None, column: str | int | None, message: str) -> FlightError:
+def refuse(
+    path: Path, line: int | None, column: str | int | None, message: str, *, needs: str | None = None
+) -> FlightError:
     """The FlightError ``path:line: column c: message``, to be raised by the caller."""
     where = str(path) if line is None else f"{path}:{line}"
     if column is not None:
         where += f": column {column}"
-    return FlightError(f"{where}: {message}")
+    return FlightError(f"{where}: {message}", needs=needs)
 
 
 def nearest(word: str, known: Sequence[str]) -> str:

@@ -204,7 +204,7 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     assert any("look like wxyz" in line for line in inspect(order) if line.startswith("  FAULT"))
 
     two = bag(tmp_path / "two", "mcap", topics=("odom",), twice=True)
-    assert "choose one with --topic" in refused(tmp_path / "h", two)
+    assert "choose one of /vins/odometry" in refused(tmp_path / "h", two)
     assert "is there already" in run("import", order, "--out", tmp_path / "n")[1]
     assert "--imu-units 'furlong' is unknown" in refused(tmp_path / "i", order, "--imu-units", "furlong")
     assert "--camera has 3 numbers" in refused(tmp_path / "j", order, "--camera", "1,2,3")

@@ -1,25 +1,28 @@
 """Logs in: what people's flights are really written in, to one normal form (``Log``).
 
 ``read_log`` finds out what a file or folder is. The libraries of binary logs are optional (``pip install
-'brmgeo[logs]'``) and loaded when first needed. The formats ``rosbag``, ``ulog`` and ``ardupilot`` of flight.toml are
-registered here.
+'brmgeo[logs]'``) and loaded when first needed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from brmgeo.errors import FlightError, MissingInputError
-from brmgeo.flight.logs.ardupilot import read_ardupilot
-from brmgeo.flight.logs.photos import PHOTO_SUFFIXES, read_photos
-from brmgeo.flight.logs.rosbag import read_rosbag
-from brmgeo.flight.logs.text import read_text_log
-from brmgeo.flight.logs.ulog import read_ulog
-from brmgeo.flight.logs.values import CameraFrames, Gnss, Height, Log, LogOptions, Orientation
-from brmgeo.flight.odometry import OdometryOptions, Reader, register
-from brmgeo.flight.readings import Odometry
+from brmgeo.flight.logs.values import PHOTO_SUFFIXES, CameraFrames, Gnss, Height, Log, LogOptions, Orientation
 
-__all__ = ["CameraFrames", "Gnss", "Height", "Log", "LogOptions", "Orientation", "kind_of", "read_log"]
+__all__ = [
+    "READERS",
+    "CameraFrames",
+    "Gnss",
+    "Height",
+    "Log",
+    "LogOptions",
+    "Orientation",
+    "kind_of",
+    "read_log",
+]
 
 _BY_SUFFIX = {
     ".bag": "rosbag",
@@ -30,12 +33,45 @@ _BY_SUFFIX = {
     ".log": "ardupilot",
     ".tlog": "ardupilot",
 }
-_READERS = {
-    "rosbag": read_rosbag,
-    "ulog": read_ulog,
-    "ardupilot": read_ardupilot,
-    "photos": read_photos,
-    "text": read_text_log,
+
+
+def _rosbag(path: Path, options: LogOptions) -> Log:
+    from brmgeo.flight.logs.rosbag import read_rosbag
+
+    return read_rosbag(path, options)
+
+
+def _ulog(path: Path, options: LogOptions) -> Log:
+    from brmgeo.flight.logs.ulog import read_ulog
+
+    return read_ulog(path, options)
+
+
+def _ardupilot(path: Path, options: LogOptions) -> Log:
+    from brmgeo.flight.logs.ardupilot import read_ardupilot
+
+    return read_ardupilot(path, options)
+
+
+def _photos(path: Path, options: LogOptions) -> Log:
+    from brmgeo.flight.logs.photos import read_photos
+
+    return read_photos(path, options)
+
+
+def _text(path: Path, options: LogOptions) -> Log:
+    from brmgeo.flight.logs.text import read_text_log
+
+    return read_text_log(path, options)
+
+
+#: Readers by what ``kind_of`` says, each loaded when first asked for.
+READERS: dict[str, Callable[[Path, LogOptions], Log]] = {
+    "rosbag": _rosbag,
+    "ulog": _ulog,
+    "ardupilot": _ardupilot,
+    "photos": _photos,
+    "text": _text,
 }
 
 
@@ -73,31 +109,10 @@ def kind_of(path: Path) -> str:
 def read_log(path: Path | str, options: LogOptions | None = None) -> Log:
     """The log, bag, text of poses or folder of photos at ``path``, in the normal form.
 
-    Raises FlightError or MissingInputError, one line each: see the readers of the formats.
+    Raises FlightError, MissingInputError or MissingExtraError, one line each: see the readers of the formats.
     """
     path = Path(path)
     kind = kind_of(path)
     if kind == "flight":
         raise FlightError(f"{path}: this is a flight folder already")
-    return _READERS[kind](path, options or LogOptions())
-
-
-def _reader(kind: str) -> Reader:
-    def read(path: Path, options: OdometryOptions) -> Odometry:
-        if options.quaternion is not None:
-            raise FlightError(
-                f"{path}: quaternion order is given, but this format names its parts: remove 'quaternion'"
-            )
-        try:
-            log = _READERS[kind](path, LogOptions(options.topic, only_odometry=True))
-        except MissingInputError as error:
-            raise FlightError(str(error)) from None
-        if log.odometry is None or not len(log.odometry.t_s):
-            raise FlightError(f"{path}: the log holds no odometry: remove [odometry] or give another file")
-        return log.odometry
-
-    return read
-
-
-for _kind in ("rosbag", "ulog", "ardupilot"):
-    register(_kind, _reader(_kind))
+    return READERS[kind](path, options or LogOptions())

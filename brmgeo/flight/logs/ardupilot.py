@@ -1,24 +1,20 @@
-"""ArduPilot logs in: dataflash .bin/.log and telemetry .tlog, through pymavlink (LGPL-3.0).
+"""ArduPilot logs in: dataflash .bin/.log, through pymavlink (LGPL-3.0), and telemetry by its ending.
 
 ArduPilot writes body FRD in NED, angles in degrees; times are TimeUS since boot, or TimeMS before 2015. Message names
-after the ArduPilot "Log Messages" and the MAVLink "common" definitions.
+after the ArduPilot "Log Messages".
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.errors import FlightError
 from brmgeo.flight.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, quaternion_from_euler
-from brmgeo.flight.logs.ulog import mixed
-from brmgeo.flight.logs.values import Gnss, Height, Log, LogOptions, Orientation, choose, missing_library
+from brmgeo.flight.logs.mavlink import Clock, Messages, library, opened, read_telemetry, rows_of
+from brmgeo.flight.logs.values import Gnss, Height, Log, LogOptions, Orientation, choose, mixed
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 
 #: Filters in order of worth: EKF3, EKF2, EKF1 of the TimeMS era (positions PN, PE, PD), and visual odometry.
@@ -38,92 +34,51 @@ _DATAFLASH = (
     "MSG",
     "ORGN",
 )
-_TELEMETRY = (
-    "LOCAL_POSITION_NED",
-    "ODOMETRY",
-    "VISION_POSITION_ESTIMATE",
-    "ATTITUDE",
-    "ATTITUDE_QUATERNION",
-    "HIGHRES_IMU",
-    "SCALED_IMU",
-    "RAW_IMU",
-    "DISTANCE_SENSOR",
-    "RANGEFINDER",
-    "GPS_RAW_INT",
-    "CAMERA_FEEDBACK",
-    "CAMERA_IMAGE_CAPTURED",
-    "CAMERA_TRIGGER",
-)
-_G = 9.80665
-
-
-def _rows(messages: list[Any], get: Callable[[Any], list[float]], needed: int | None = None) -> FloatArray:
-    # (n, k) rows whose first column, the time, grows and whose first ``needed`` are numbers; a message that lacks a
-    # field is of another version, or damaged, and left out.
-    out: list[list[float]] = []
-    last = -np.inf
-    for message in messages:
-        try:
-            row = get(message)
-        except AttributeError:
-            continue
-        if row[0] > last and all(np.isfinite(v) for v in row[:needed]):
-            out.append(row)
-            last = row[0]
-    return np.array(out, dtype=np.float64) if out else np.empty((0, 0))
-
-
-def _opened(path: Path, names: tuple[str, ...], log: Any) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = {}
-    while (message := log.recv_match(type=list(names))) is not None:
-        found.setdefault(message.get_type(), []).append(message)
-    return found
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    # The library's C part complains of every damaged byte straight to file descriptor 2.
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-@contextlib.contextmanager
-def _library(path: Path) -> Iterator[Any]:
-    os.environ.setdefault("MAVLINK20", "1")
-    try:
-        from pymavlink import DFReader, mavutil
-    except ImportError:
-        raise missing_library(path, "ArduPilot logs", "pymavlink") from None
-    if not path.is_file():
-        raise MissingInputError(f"{path}: the log is missing")
-    try:
-        with contextlib.redirect_stdout(io.StringIO()), _quiet():
-            yield DFReader, mavutil
-    except FlightError:
-        raise
-    except Exception as error:  # damaged bytes make the library raise nearly anything
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise FlightError(
-            f"{path}: no readable ArduPilot log ({reason}): download it from the vehicle again"
-        ) from None
 
 
 def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
     """The streams of an ArduPilot log (.bin, .log) or of MAVLink telemetry (.tlog) that a flight needs.
 
-    Raises FlightError for files that are no such log and an odometry asked for that is not there; MissingInputError
+    Raises FlightError for files that are no such log and an odometry asked for that is not there; MissingExtraError
     without the package pymavlink.
     """
     options = options or LogOptions()
     if path.suffix.lower() == ".tlog":
-        return _telemetry(path, options)
-    with _library(path) as (reader, _):
+        return read_telemetry(path, options)
+    found = _messages(path)
+    notes: list[str] = []
+    time = _boot_seconds(found)
+    euler = rows_of(found.get("ATT", []), lambda m: [time(m), m.Roll, m.Pitch, m.Yaw])
+    attitude = None
+    if euler.size:
+        attitude = Orientation(euler[:, 0], _from_degrees(euler[:, 1:4]), True, "ATT")
+    counts, odometry = _odometry(path, found, time, attitude, options, notes)
+    gnss = _gnss(found, time)
+    own = odometry is not None and odometry.source != "VISP"
+    if odometry is not None and own:
+        more = (
+            ", which GNSS goes into: it is no odometry of a flight without GNSS" if gnss is not None else ""
+        )
+        notes.append(f"{odometry.source} is the autopilot's own estimate{more}")
+    cameras = rows_of(found.get("CAM", []) or found.get("TRIG", []), lambda m: [time(m)])
+    return Log(
+        kind="ardupilot",
+        title=next((str(m.Message) for m in found.get("MSG", [])), "ArduPilot dataflash log"),
+        clock="seconds since the autopilot's boot",
+        odometry=odometry,
+        uses_gnss=gnss is not None if own else None,
+        candidates=counts,
+        imu=_imu(found, time),
+        height=_height(found, time, odometry),
+        attitude=attitude,
+        gnss=gnss,
+        triggers_s=cameras[:, 0] if cameras.size else None,
+        notes=tuple(notes),
+    )
+
+
+def _messages(path: Path) -> Messages:
+    with library(path) as (reader, _):
         if path.suffix.lower() == ".log":
             log = reader.DFReader_text(str(path), zero_time_base=True)
         else:
@@ -133,88 +88,61 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
                 )
             log = reader.DFReader_binary(str(path), zero_time_base=True)
         try:
-            found = _opened(path, _DATAFLASH, log)
+            found = opened(_DATAFLASH, log)
         finally:
             close = getattr(log, "close", None)
             if close is not None:
                 close()
     if not found:
         raise FlightError(f"{path}: the log holds none of the messages of a flight: is it cut short?")
-    notes: list[str] = []
-    boot = _boot_seconds(found)
+    return found
 
-    def time(m: Any) -> float:
-        return boot(m)
 
-    euler = _rows(found.get("ATT", []), lambda m: [time(m), m.Roll, m.Pitch, m.Yaw])
-    attitude = None
-    if euler.size:
-        attitude = Orientation(euler[:, 0], _from_degrees(euler[:, 1:4]), True, "ATT")
+def _odometry(
+    path: Path,
+    found: Messages,
+    time: Clock,
+    attitude: Orientation | None,
+    options: LogOptions,
+    notes: list[str],
+) -> tuple[tuple[str, ...], Odometry | None]:
+    # The names of every track that is there, and the chosen one.
     streams = {name: _core(found[name]) for name in _FILTERS if name in found}
     counts = {name: len(rows) for name, rows in streams.items() if rows}
-    seen = _rows(
+    seen = rows_of(
         found.get("VISP", []),
         lambda m: [time(m), m.PX, m.PY, m.PZ, m.Roll, m.Pitch, m.Yaw, getattr(m, "Rst", 0)],
     )
     if seen.size:
         counts = {"VISP": len(seen)} | counts
-    stream = choose(path, "odometry", "--topic", options.topic, counts, any_topic=True)
-    odometry = None
+    stream = choose(path, "odometry", options.topic, counts, needs="topic", any_topic=True)
+    if stream is None:
+        return tuple(counts), None
     if stream == "VISP":
         segment = seen[:, 7].astype(np.int64)
-        odometry = Odometry(
-            seen[:, 0], enu_from_ned(seen[:, 1:4]), _from_degrees(seen[:, 4:7]), "VISP", segment
-        )
-    elif stream is not None:
-        rows = _rows(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw])
-        begun = (
-            np.flatnonzero(rows[:, 1:4].any(axis=1)) if rows.size else np.empty(0, np.int64)
-        )  # the filter says zero until it has an origin
-        if begun.size:
-            rows = rows[begun[0] :]
-            wxyz = _from_degrees(rows[:, 4:7])
-            if attitude is not None and stream == "EKF1":
-                wxyz = mixed(
-                    attitude.t_s, attitude.wxyz, rows[:, 0]
-                )  # EKF1 tells angles late in some versions
-            odometry = Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream)
-        else:
-            notes.append(f"{stream} says zero throughout: the filter never had a position")
-    imu = None
+        xyz = enu_from_ned(seen[:, 1:4])
+        return tuple(counts), Odometry(seen[:, 0], xyz, _from_degrees(seen[:, 4:7]), "VISP", segment)
+    rows = rows_of(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw])
+    # The filter says zero until it has an origin.
+    begun = np.flatnonzero(rows[:, 1:4].any(axis=1)) if rows.size else np.empty(0, np.int64)
+    if not begun.size:
+        notes.append(f"{stream} says zero throughout: the filter never had a position")
+        return tuple(counts), None
+    rows = rows[begun[0] :]
+    wxyz = _from_degrees(rows[:, 4:7])
+    if attitude is not None and stream == "EKF1":
+        # EKF1 tells angles late in some versions.
+        wxyz = mixed(attitude.t_s, attitude.wxyz, rows[:, 0])
+    return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream)
+
+
+def _imu(found: Messages, time: Clock) -> Imu | None:
     inertial = [m for m in found.get("IMU", []) if getattr(m, "I", 0) == 0]
-    if inertial:
-        rows = _rows(inertial, lambda m: [time(m), m.GyrX, m.GyrY, m.GyrZ, m.AccX, m.AccY, m.AccZ])
-        if rows.size:
-            imu = Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]), flu_from_frd(rows[:, 4:7]))
-    gnss = _gnss(found, time)
-    if odometry is not None and stream != "VISP":
-        notes.append(
-            f"{stream} is the autopilot's own estimate"
-            + (
-                ", which GNSS goes into: it is no odometry of a flight without GNSS"
-                if gnss is not None
-                else ""
-            )
-        )
-    cameras = _rows(found.get("CAM", []) or found.get("TRIG", []), lambda m: [time(m)])
-    first = next((str(m.Message) for m in found.get("MSG", [])), "ArduPilot dataflash log")
-    return Log(
-        "ardupilot",
-        first,
-        "seconds since the autopilot's boot",
-        odometry,
-        None if odometry is None or stream == "VISP" else gnss is not None,
-        tuple(counts),
-        imu,
-        _height(found, time, odometry),
-        attitude,
-        gnss,
-        triggers_s=cameras[:, 0] if cameras.size else None,
-        notes=tuple(notes),
-    )
+    rows = rows_of(inertial, lambda m: [time(m), m.GyrX, m.GyrY, m.GyrZ, m.AccX, m.AccY, m.AccZ])
+    return Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]), flu_from_frd(rows[:, 4:7])) if rows.size else None
 
 
-def _boot_seconds(found: dict[str, list[Any]]) -> Callable[[Any], float]:
+def _boot_seconds(found: Messages) -> Clock:
     # TimeUS; before 2015 TimeMS. The GPS of that era tells the time of week as TimeMS and the boot time as T.
     def seconds(message: Any) -> float:
         fields = message.get_fieldnames()
@@ -240,13 +168,13 @@ def _from_degrees(angles: FloatArray) -> FloatArray:
     return enu_flu_from_ned_frd(quaternion_from_euler(*np.radians(angles).T))
 
 
-def _gnss(found: dict[str, list[Any]], time: Callable[[Any], float]) -> Gnss | None:
+def _gnss(found: Messages, time: Clock) -> Gnss | None:
     fixes = [m for m in found.get("GPS", []) if getattr(m, "Status", 0) >= 3 and getattr(m, "I", 0) == 0]
-    rows = _rows(fixes, lambda m: [time(m), m.Lng, m.Lat, m.Alt])
+    rows = rows_of(fixes, lambda m: [time(m), m.Lng, m.Lat, m.Alt])
     if not rows.size:
         return None
     sigma = np.full(len(rows), np.nan)
-    accuracy = _rows(
+    accuracy = rows_of(
         [m for m in found.get("GPA", []) if getattr(m, "I", 0) == 0], lambda m: [time(m), m.HAcc]
     )
     if accuracy.size:
@@ -254,142 +182,13 @@ def _gnss(found: dict[str, list[Any]], time: Callable[[Any], float]) -> Gnss | N
     return Gnss(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], sigma)
 
 
-def _height(
-    found: dict[str, list[Any]], time: Callable[[Any], float], odometry: Odometry | None
-) -> Height | None:
+def _height(found: Messages, time: Clock, odometry: Odometry | None) -> Height | None:
     ranges = [
         m for m in found.get("RFND", []) if getattr(m, "Orient", 25) == 25 and getattr(m, "Stat", 4) == 4
     ]
-    rows = _rows(ranges, lambda m: [time(m), m.Dist if hasattr(m, "Dist") else m.Dist1])
+    rows = rows_of(ranges, lambda m: [time(m), m.Dist if hasattr(m, "Dist") else m.Dist1])
     if rows.size and (rows[:, 1] > 0.0).any():
         return Height(rows[:, 0], rows[:, 1], "ground", "RFND")
     if odometry is not None:
         return Height(odometry.t_s, odometry.xyz_m[:, 2], "take-off", odometry.source)
     return None
-
-
-def _telemetry(path: Path, options: LogOptions) -> Log:
-    with _library(path) as (_, mavutil):
-        log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega", notimestamps=False)
-        try:
-            found = _opened(path, _TELEMETRY, log)
-        finally:
-            log.close()
-    if not found:
-        raise FlightError(f"{path}: no MAVLink message of a flight: is it a .tlog, and whole?")
-    # A ground station hears itself and others: the vehicle is the one that tells most.
-    senders: dict[int, int] = {}
-    for messages in found.values():
-        for m in messages:
-            senders[m.get_srcSystem()] = senders.get(m.get_srcSystem(), 0) + 1
-    vehicle = max(senders, key=lambda s: senders[s])
-    found = {n: kept for n, ms in found.items() if (kept := [m for m in ms if m.get_srcSystem() == vehicle])}
-    notes = [f"MAVLink system {vehicle}"] + ([f"of {sorted(senders)}"] if len(senders) > 1 else [])
-
-    booted = [
-        (m._timestamp - m.time_boot_ms * 1e-3)
-        for ms in found.values()
-        for m in ms
-        if hasattr(m, "time_boot_ms")
-    ]
-    start = float(np.median(booted)) if booted else 0.0
-
-    def time(m: Any) -> float:
-        if hasattr(m, "time_boot_ms"):
-            return float(m.time_boot_ms) * 1e-3
-        stamp = getattr(m, "time_usec", getattr(m, "usec", 0)) * 1e-6
-        # Some senders put Unix time there; the boot time is then that of the ground station's receipt.
-        return float(stamp) if 0.0 < stamp < 1e8 else float(m._timestamp - start)
-
-    attitude = None
-    euler = _rows(found.get("ATTITUDE", []), lambda m: [time(m), m.roll, m.pitch, m.yaw])
-    quaternions = _rows(found.get("ATTITUDE_QUATERNION", []), lambda m: [time(m), m.q1, m.q2, m.q3, m.q4])
-    if euler.size:
-        wxyz = enu_flu_from_ned_frd(quaternion_from_euler(*euler[:, 1:4].T))
-        attitude = Orientation(euler[:, 0], wxyz, True, "ATTITUDE")
-    elif quaternions.size:
-        wxyz = enu_flu_from_ned_frd(quaternions[:, 1:5])
-        attitude = Orientation(quaternions[:, 0], wxyz, True, "ATTITUDE_QUATERNION")
-    # A filter without a position says NaN: then there is no odometry of it.
-    tracks = {
-        "VISION_POSITION_ESTIMATE": _rows(
-            found.get("VISION_POSITION_ESTIMATE", []),
-            lambda m: [time(m), m.x, m.y, m.z, m.roll, m.pitch, m.yaw, getattr(m, "reset_counter", 0)],
-        ),
-        "LOCAL_POSITION_NED": _rows(
-            found.get("LOCAL_POSITION_NED", []) if attitude is not None else [],
-            lambda m: [time(m), m.x, m.y, m.z],
-        ),
-    }
-    counts = {name: len(rows) for name, rows in tracks.items() if rows.size}
-    stream = choose(path, "odometry", "--topic", options.topic, counts, any_topic=True)
-    odometry = None
-    if stream == "LOCAL_POSITION_NED":
-        assert attitude is not None
-        rows = tracks[stream]
-        odometry = Odometry(
-            rows[:, 0], enu_from_ned(rows[:, 1:4]), mixed(attitude.t_s, attitude.wxyz, rows[:, 0]), stream
-        )
-    elif stream is not None:
-        rows = tracks[stream]
-        wxyz = enu_flu_from_ned_frd(quaternion_from_euler(*rows[:, 4:7].T))
-        odometry = Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream, rows[:, 7].astype(np.int64))
-    imu = None
-    name = next((n for n in ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU") if n in found), None)
-    if name is not None:
-        gyro, accel = (
-            (1.0, 1.0) if name == "HIGHRES_IMU" else (1e-3, _G * 1e-3)
-        )  # milliradians, thousandths of g
-        rows = _rows(found[name], lambda m: [time(m), m.xgyro, m.ygyro, m.zgyro, m.xacc, m.yacc, m.zacc])
-        if rows.size:
-            imu = Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]) * gyro, flu_from_frd(rows[:, 4:7]) * accel)
-    height = None
-    down = _rows(
-        [m for m in found.get("DISTANCE_SENSOR", []) if m.orientation == 25],
-        lambda m: [time(m), m.current_distance / 100.0],
-    )
-    ranges = _rows(found.get("RANGEFINDER", []), lambda m: [time(m), m.distance])
-    if down.size:
-        height = Height(down[:, 0], down[:, 1], "ground", "DISTANCE_SENSOR")
-    elif ranges.size and (ranges[:, 1] > 0.0).any():
-        height = Height(ranges[:, 0], ranges[:, 1], "ground", "RANGEFINDER")
-    elif odometry is not None:
-        height = Height(odometry.t_s, odometry.xyz_m[:, 2], "take-off", odometry.source)
-    gnss = None
-    rows = _rows(
-        [m for m in found.get("GPS_RAW_INT", []) if m.fix_type >= 3],
-        lambda m: [
-            time(m),
-            m.lon * 1e-7,
-            m.lat * 1e-7,
-            m.alt * 1e-3,
-            (getattr(m, "h_acc", 0) or np.nan) * 1e-3,
-        ],
-        4,
-    )
-    if rows.size:
-        gnss = Gnss(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4])
-    if stream == "LOCAL_POSITION_NED":
-        notes.append(
-            "LOCAL_POSITION_NED is the autopilot's own estimate"
-            + (", which GNSS goes into" if rows.size else "")
-        )
-    shots = next((found[n] for n in _TELEMETRY[-3:] if n in found), [])
-    cameras = _rows(shots, lambda m: [time(m)])
-    return Log(
-        "mavlink",
-        "MAVLink telemetry (.tlog)",
-        "seconds since the autopilot's boot",
-        odometry,
-        None if stream != "LOCAL_POSITION_NED" else bool(rows.size),
-        tuple(counts),
-        imu,
-        height,
-        attitude,
-        gnss,
-        triggers_s=cameras[:, 0] if cameras.size else None,
-        notes=(
-            ", ".join(notes[:2]) if len(senders) > 1 else notes[0],
-            *notes[2 if len(senders) > 1 else 1 :],
-        ),
-    )

@@ -7,6 +7,7 @@ file beside the photos goes before the photos' own tags: it is there because it 
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import re
 import warnings
@@ -23,13 +24,13 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from brmgeo.errors import FlightError, MissingInputError
 from brmgeo.flight.frames import (
     enu_flu_from_ned_frd,
+    inverse,
     multiply,
     quaternion_from_euler,
 )
-from brmgeo.flight.logs.values import CameraFrames, Gnss, Height, Log, LogOptions, Orientation
+from brmgeo.flight.logs.values import PHOTO_SUFFIXES, CameraFrames, Gnss, Height, Log, LogOptions, Orientation
 from brmgeo.flight.readings import Camera, FloatArray
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".dng")
 _FULL_FRAME_DIAGONAL_MM = 43.2666
 #: Pitch that takes a camera that looks ahead to one that looks down.
 _NADIR_FROM_AHEAD = quaternion_from_euler(np.array(0.0), np.array(-math.pi / 2), np.array(0.0))
@@ -70,70 +71,13 @@ def read_photos(path: Path, options: LogOptions | None = None) -> Log:
         raise MissingInputError(f"{path}: no photos here (looked for {', '.join(PHOTO_SUFFIXES)})")
     photos = [_photo(p) for p in files]
     notes: list[str] = []
-    faults: list[str] = []
     _lists(path, photos, notes)
-
-    sizes = {p.size for p in photos}
-    if len(sizes) > 1:
-        odd = next(p for p in photos if p.size != photos[0].size)
-        raise FlightError(
-            f"{odd.path}: {odd.size[0]} x {odd.size[1]} pixels, but {photos[0].path.name} has "
-            f"{photos[0].size[0]} x {photos[0].size[1]}: give photos of one camera, upright ones apart"
-        )
-    timeless = [p for p in photos if math.isnan(p.t_s)]
-    if timeless:
-        raise FlightError(
-            f"{timeless[0].path}: no time of exposure in EXIF (DateTimeOriginal) or in a list beside the photos: copy the "
-            "originals, tags are lost when photos are edited or sent"
-        )
+    photos = _in_order(photos, notes)
     t = np.array([p.t_s for p in photos])
-    order = np.argsort(t, kind="stable")
-    if (order != np.arange(len(t))).any():
-        notes.append("the photos' names are not in order of time; they were sorted by time")
-    photos = [photos[i] for i in order]
-    t = t[order]
-    same = np.flatnonzero(np.diff(t) <= 0.0)
-    if same.size:
-        i = int(same[0])
-        raise FlightError(
-            f"{photos[i + 1].path}: the same time as {photos[i].path.name}, to the whole second: give a .MRK or CSV with "
-            "finer times beside the photos, or leave one out"
-        )
     first = datetime.fromtimestamp(t[0], UTC)
     t = t - t[0]
-
-    lonlat = np.array([[p.lon, p.lat] for p in photos])
-    placed = np.isfinite(lonlat).all(axis=1)
-    gnss = None
-    if placed.any():
-        some = [p for p, good in zip(photos, placed) if good]
-        gnss = Gnss(
-            t[placed],
-            lonlat[placed, 0],
-            lonlat[placed, 1],
-            np.array([p.alt for p in some]),
-            np.array([p.sigma for p in some]),
-        )
-        if not placed.all():
-            lost = photos[int(np.flatnonzero(~placed)[0])]
-            notes.append(f"{int((~placed).sum())} photos have no place, the first is {lost.path.name}")
-    else:
-        faults.append("no photo has a place in its tags")
-    height = None
-    for name, above in (("above_ground", "ground"), ("above_takeoff", "take-off")):
-        values = np.array([getattr(p, name) for p in photos])
-        if np.isfinite(values).all():
-            height = Height(
-                t, values, above, f"{name.replace('_', ' ')} of {'the list' if photos[0].listed else 'XMP'}"
-            )
-
-            break
-    attitude = None
-    turned = [p.wxyz for p in photos if p.wxyz is not None]
-    if len(turned) == len(photos):
-        attitude = Orientation(t, np.stack(turned), True, photos[0].turned_by, of_camera=True)
-    elif turned:
-        notes.append(f"{len(photos) - len(turned)} photos have no attitude, so none is used")
+    gnss = _gnss(photos, t, notes)
+    attitude = _attitude(photos, t, notes)
     camera = photos[0].camera
     if camera is not None:
         notes.append(f"camera from {photos[0].camera_from}: focal length {camera.fx:.0f} px")
@@ -151,14 +95,72 @@ def read_photos(path: Path, options: LogOptions | None = None) -> Log:
         "photos",
         f"{len(photos)} photos{', ' + photos[0].make if photos[0].make else ''}",
         f"seconds since the first photo, {first:%Y-%m-%d %H:%M:%S} by the camera's clock",
-        height=height,
+        height=_height(photos, t),
         attitude=attitude,
         gnss=gnss,
         frames=CameraFrames(t, names, images, photos[0].size, "photos"),
         camera=camera,
         notes=tuple(notes),
-        faults=tuple(faults),
+        faults=() if gnss is not None else ("no photo has a place in its tags",),
     )
+
+
+def _in_order(photos: list[_Photo], notes: list[str]) -> list[_Photo]:
+    # Sorted by time; FlightError for photos of several sizes, without a time, or of one time.
+    if len({p.size for p in photos}) > 1:
+        odd = next(p for p in photos if p.size != photos[0].size)
+        raise FlightError(
+            f"{odd.path}: {odd.size[0]} x {odd.size[1]} pixels, but {photos[0].path.name} has "
+            f"{photos[0].size[0]} x {photos[0].size[1]}: give photos of one camera, upright ones apart"
+        )
+    timeless = [p for p in photos if math.isnan(p.t_s)]
+    if timeless:
+        raise FlightError(
+            f"{timeless[0].path}: no time of exposure in EXIF (DateTimeOriginal) or in a list beside the photos: copy the "
+            "originals, tags are lost when photos are edited or sent"
+        )
+    order = np.argsort(np.array([p.t_s for p in photos]), kind="stable")
+    if (order != np.arange(len(photos))).any():
+        notes.append("the photos' names are not in order of time; they were sorted by time")
+    photos = [photos[i] for i in order]
+    for before, photo in itertools.pairwise(photos):
+        if photo.t_s <= before.t_s:
+            raise FlightError(
+                f"{photo.path}: the same time as {before.path.name}, to the whole second: give a .MRK or CSV with "
+                "finer times beside the photos, or leave one out"
+            )
+    return photos
+
+
+def _gnss(photos: list[_Photo], t: FloatArray, notes: list[str]) -> Gnss | None:
+    lonlat = np.array([[p.lon, p.lat] for p in photos])
+    placed = np.isfinite(lonlat).all(axis=1)
+    if not placed.any():
+        return None
+    if not placed.all():
+        lost = photos[int(np.flatnonzero(~placed)[0])]
+        notes.append(f"{int((~placed).sum())} photos have no place, the first is {lost.path.name}")
+    some = [p for p, good in zip(photos, placed) if good]
+    alt, sigma = np.array([p.alt for p in some]), np.array([p.sigma for p in some])
+    return Gnss(t[placed], lonlat[placed, 0], lonlat[placed, 1], alt, sigma)
+
+
+def _height(photos: list[_Photo], t: FloatArray) -> Height | None:
+    for name, above in (("above_ground", "ground"), ("above_takeoff", "take-off")):
+        values = np.array([getattr(p, name) for p in photos])
+        if np.isfinite(values).all():
+            teller = "the list" if photos[0].listed else "XMP"
+            return Height(t, values, above, f"{name.replace('_', ' ')} of {teller}")
+    return None
+
+
+def _attitude(photos: list[_Photo], t: FloatArray, notes: list[str]) -> Orientation | None:
+    turned = [p.wxyz for p in photos if p.wxyz is not None]
+    if len(turned) == len(photos):
+        return Orientation(t, np.stack(turned), True, photos[0].turned_by, of_camera=True)
+    if turned:
+        notes.append(f"{len(photos) - len(turned)} photos have no attitude, so none is used")
+    return None
 
 
 # ---------------------------------------------------------------- one photo
@@ -253,16 +255,12 @@ def _ahead(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Attitude (FLU in ENU) of the body that a nadir camera sits in, of a camera told as looking ahead (FRD, degrees)."""
     looking = quaternion_from_euler(*(np.radians(np.array(v)) for v in (roll, pitch, yaw)))
     # At pitch -90 the camera looks down and its top points along the heading: that is the nadir camera at rest.
-    return enu_flu_from_ned_frd(multiply(looking, _inverse(_NADIR_FROM_AHEAD)))
+    return enu_flu_from_ned_frd(multiply(looking, inverse(_NADIR_FROM_AHEAD)))
 
 
 def _down(roll: float, pitch: float, yaw: float) -> FloatArray:
     """The same of a camera, or an aircraft with a nadir camera, told as level at zero (FRD, degrees)."""
     return enu_flu_from_ned_frd(quaternion_from_euler(*(np.radians(np.array(v)) for v in (roll, pitch, yaw))))
-
-
-def _inverse(wxyz: FloatArray) -> FloatArray:
-    return wxyz * [1.0, -1.0, -1.0, -1.0]
 
 
 def _vendor(photo: _Photo, tags: dict[str, str]) -> None:

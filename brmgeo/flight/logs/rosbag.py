@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import BrmgeoError, FlightError, MissingInputError
+from brmgeo.errors import BrmgeoError, FlightError, InputError, MissingInputError
+from brmgeo.extras import extra
 from brmgeo.flight.logs.values import (
     CameraFrames,
     Gnss,
@@ -25,11 +26,11 @@ from brmgeo.flight.logs.values import (
     LogOptions,
     Orientation,
     choose,
-    missing_library,
     ordered,
     unit,
 )
 from brmgeo.flight.readings import Camera, FloatArray, Imu, Odometry
+from brmgeo.pictures import decode
 
 _ODOMETRY = (
     "nav_msgs/msg/Odometry",
@@ -92,11 +93,9 @@ class _Stream:
 
 @contextmanager
 def _open(path: Path) -> Iterator[Any]:
-    try:
+    with extra("logs", "reading ROS bags"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise missing_library(path, "ROS bags", "rosbags") from None
     if not path.exists():
         raise MissingInputError(f"{path}: the bag is missing")
     place = path
@@ -157,155 +156,200 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
     """The streams of a ROS bag that a flight needs.
 
     Raises FlightError when several topics hold odometry or pictures and none is chosen (the message lists them), for
-    damaged bags, stamps that jump back, empty quaternions; MissingInputError without the package rosbags.
+    damaged bags, stamps that jump back, empty quaternions; MissingExtraError without the package rosbags.
     """
     options = options or LogOptions()
-    more = not options.only_odometry
     notes: list[str] = []
     with _open(path) as reader:
-        poses, links = _odometry_counts(reader)
-        wanted = options.topic
-        pool = (
-            poses
-            if (wanted is None and poses) or wanted in poses
-            else links
-            if wanted is None
-            else poses | links
-        )
-        first_kind = _counts(reader, _ODOMETRY[:1])
-        if wanted is None and first_kind:
-            pool = first_kind  # nav_msgs/Odometry is meant to be odometry; a PoseStamped may be a goal
-        topic = choose(path, "odometry", "--topic", wanted, pool, options.any_topic)
-        image_topic = choose(
-            path,
-            "pictures",
-            "--image-topic",
-            options.image_topic,
-            _counts(reader, _IMAGES) if more else {},
-            options.any_topic,
-        )
-        imus = _counts(reader, (_IMU,)) if more else {}
-        imu_topic = choose(path, "inertial readings", "--imu-topic", options.imu_topic, imus, True)
-        if len(imus) > 1 and options.imu_topic is None:
-            notes.append(
-                f"{imu_topic} is taken of {len(imus)} inertial streams: {', '.join(imus)} (--imu-topic)"
-            )
-        fixes = _counts(reader, (_FIX,)) if more else {}
-        fix_topic = max(fixes, key=lambda name: fixes[name], default=None)
-        range_topic = next(iter(_counts(reader, (_RANGE,)) if more else ()), None)
-        infos = list(_counts(reader, (_INFO,)) if more else ())
-        info_topic = None
-        if image_topic and infos:
-            base = image_topic.split("/image")[0]
-            info_topic = next(
-                (i for i in infos if i.rsplit("/", 1)[0] == base), infos[0] if len(infos) == 1 else None
-            )
-
-        streams = {
-            name: _Stream() for name in (topic, image_topic, imu_topic, fix_topic, range_topic) if name
-        }
-        tf = topic.split(" ")[0] if topic and ">" in topic and topic in links else None
-        sizes: list[tuple[int, int]] = []
-        suffix = ".png"
-        camera: Camera | None = None
-        frame_ids = ""
-        taken = {tf or topic, image_topic, imu_topic, fix_topic, range_topic, info_topic}
+        topics = _chosen(path, reader, options, notes)
+        got = _Gathered(path, topics, notes)
+        taken = topics.taken
         connections = [c for c in reader.connections if c.topic in taken]
         for connection, recorded, raw in reader.messages(connections=connections) if connections else ():
-            message = reader.deserialize(raw, connection.msgtype)
-            name = connection.topic
-            if tf and name == tf:
-                for link in message.transforms:
-                    assert topic is not None
-                    if f"{tf} {link.header.frame_id.strip('/')}>{link.child_frame_id.strip('/')}" == topic:
-                        streams[topic].add(link.header.stamp, recorded, _pose(link))
-            elif name == topic:
-                streams[name].add(message.header.stamp, recorded, _pose(message))
-                frame_ids = (
-                    frame_ids or f"{message.header.frame_id} > {getattr(message, 'child_frame_id', '?')}"
-                )
-            elif name == image_topic:
-                if not sizes:
-                    image, suffix = _picture(path, message)
-                    decoded = (
-                        image
-                        if isinstance(image, np.ndarray)
-                        else cv2.imdecode(np.frombuffer(image, np.uint8), -1)
-                    )
-                    if decoded is None:
-                        raise FlightError(f"{path}: {name}: the first picture cannot be decoded")
-                    sizes.append((decoded.shape[1], decoded.shape[0]))
-                streams[name].add(message.header.stamp, recorded, [len(streams[name].rows)])
-            elif name == imu_topic:
-                g, a = message.angular_velocity, message.linear_acceleration
-                # By the message's definition, -1 says that no orientation is told.
-                q, told = message.orientation, float(message.orientation_covariance[0] != -1.0)
-                turn = [told * q.w, told * q.x, told * q.y, told * q.z]
-                streams[name].add(message.header.stamp, recorded, [g.x, g.y, g.z, a.x, a.y, a.z, *turn])
-            elif name == fix_topic and message.status.status >= 0:
-                known = message.position_covariance_type > 0
-                sigma = float(np.sqrt(max(message.position_covariance[0], 0.0))) if known else np.nan
-                row = [message.longitude, message.latitude, message.altitude, sigma]
-                streams[name].add(message.header.stamp, recorded, row)
-            elif name == range_topic and message.min_range <= message.range <= message.max_range:
-                streams[name].add(message.header.stamp, recorded, [message.range])
-            elif name == info_topic and camera is None:
-                camera = _camera(message)
-                if camera is None:
-                    notes.append(
-                        f"{name}: its distortion model {message.distortion_model!r} or matrix is not used"
-                    )
+            got.take(connection.topic, reader.deserialize(raw, connection.msgtype), recorded)
         title = f"ROS {'2' if reader.is2 else '1'} bag, {len({c.topic for c in reader.connections})} topics"
         record_start = reader.start_time * 1e-9
+    return _normal(path, got, title, record_start)
 
+
+@dataclass(frozen=True, slots=True)
+class _Topics:
+    """Which topic of a bag is taken for what; ``odometry`` may be a link of transforms, "/tf odom>base_link"."""
+
+    odometry: str | None
+    image: str | None
+    imu: str | None
+    fix: str | None
+    range: str | None
+    info: str | None
+    is_link: bool
+    candidates: tuple[str, ...]
+
+    @property
+    def link_topic(self) -> str | None:
+        """The topic of transforms that holds the odometry; None for a topic of poses."""
+        return self.odometry.split(" ")[0] if self.odometry and self.is_link else None
+
+    @property
+    def taken(self) -> set[str | None]:
+        """Every topic to be read."""
+        return {
+            self.link_topic or self.odometry, self.image, self.imu, self.fix, self.range, self.info
+        }  # fmt: skip
+
+
+def _chosen(path: Path, reader: Any, options: LogOptions, notes: list[str]) -> _Topics:
+    more = not options.only_odometry
+    poses, links = _odometry_counts(reader)
+    wanted = options.topic
+    if wanted is None:
+        # nav_msgs/Odometry is meant to be odometry; a PoseStamped may be a goal.
+        pool = _counts(reader, _ODOMETRY[:1]) or poses or links
+    else:
+        pool = poses if wanted in poses else poses | links
+    any_topic = options.any_topic
+    topic = choose(path, "odometry", wanted, pool, needs="topic", any_topic=any_topic)
+    pictures = _counts(reader, _IMAGES) if more else {}
+    image = choose(path, "pictures", options.image_topic, pictures, needs="image_topic", any_topic=any_topic)
+    imus = _counts(reader, (_IMU,)) if more else {}
+    imu = choose(path, "inertial readings", options.imu_topic, imus, needs="imu_topic", any_topic=True)
+    if len(imus) > 1 and options.imu_topic is None:
+        notes.append(f"{imu} is taken of {len(imus)} inertial streams: {', '.join(imus)} (imu_topic)")
+    fixes = _counts(reader, (_FIX,)) if more else {}
+    infos = list(_counts(reader, (_INFO,)) if more else ())
+    info = None
+    if image and infos:
+        base = image.split("/image")[0]
+        info = next((i for i in infos if i.rsplit("/", 1)[0] == base), infos[0] if len(infos) == 1 else None)
+    return _Topics(
+        odometry=topic,
+        image=image,
+        imu=imu,
+        fix=max(fixes, key=lambda name: fixes[name], default=None),
+        range=next(iter(_counts(reader, (_RANGE,)) if more else ()), None),
+        info=info,
+        is_link=bool(topic and ">" in topic and topic in links),
+        candidates=tuple(poses | links),
+    )
+
+
+class _Gathered:
+    """What the messages of the chosen topics say, gathered one by one."""
+
+    def __init__(self, path: Path, topics: _Topics, notes: list[str]) -> None:
+        self.path, self.topics, self.notes = path, topics, notes
+        names = (topics.odometry, topics.image, topics.imu, topics.fix, topics.range)
+        self.streams = {name: _Stream() for name in names if name}
+        self.size: tuple[int, int] | None = None
+        self.suffix = ".png"
+        self.camera: Camera | None = None
+        self.frame_ids = ""
+
+    def take(self, name: str, message: Any, recorded: int) -> None:
+        """One message of the topic ``name``, recorded at so many nanoseconds."""
+        topics, tf = self.topics, self.topics.link_topic
+        if tf and name == tf:
+            for link in message.transforms:
+                assert topics.odometry is not None
+                if (
+                    f"{tf} {link.header.frame_id.strip('/')}>{link.child_frame_id.strip('/')}"
+                    == topics.odometry
+                ):
+                    self.streams[topics.odometry].add(link.header.stamp, recorded, _pose(link))
+        elif name == topics.odometry:
+            self.streams[name].add(message.header.stamp, recorded, _pose(message))
+            ids = f"{message.header.frame_id} > {getattr(message, 'child_frame_id', '?')}"
+            self.frame_ids = self.frame_ids or ids
+        elif name == topics.image:
+            if self.size is None:
+                self._first_picture(name, message)
+            stream = self.streams[name]
+            stream.add(message.header.stamp, recorded, [len(stream.rows)])
+        elif name == topics.imu:
+            g, a = message.angular_velocity, message.linear_acceleration
+            # By the message's definition, -1 says that no orientation is told.
+            q, told = message.orientation, float(message.orientation_covariance[0] != -1.0)
+            turn = [told * q.w, told * q.x, told * q.y, told * q.z]
+            self.streams[name].add(message.header.stamp, recorded, [g.x, g.y, g.z, a.x, a.y, a.z, *turn])
+        elif name == topics.fix and message.status.status >= 0:
+            known = message.position_covariance_type > 0
+            sigma = float(np.sqrt(max(message.position_covariance[0], 0.0))) if known else np.nan
+            row = [message.longitude, message.latitude, message.altitude, sigma]
+            self.streams[name].add(message.header.stamp, recorded, row)
+        elif name == topics.range and message.min_range <= message.range <= message.max_range:
+            self.streams[name].add(message.header.stamp, recorded, [message.range])
+        elif name == topics.info and self.camera is None:
+            self.camera = _camera(message)
+            if self.camera is None:
+                self.notes.append(
+                    f"{name}: its distortion model {message.distortion_model!r} or matrix is not used"
+                )
+
+    def _first_picture(self, name: str, message: Any) -> None:
+        image, self.suffix = _picture(self.path, message)
+        if isinstance(image, bytes):
+            try:
+                image = decode(image, f"{self.path}: {name}")
+            except InputError as error:
+                raise FlightError(f"{error}; the first picture cannot be decoded") from None
+        self.size = image.shape[1], image.shape[0]
+
+    def table(self, name: str | None, width: int) -> tuple[FloatArray, FloatArray] | None:
+        """Times in order and their rows (n, width) of a topic; None where it is not taken, or empty."""
+        if not name or not self.streams[name].rows:
+            return None
+        return self.streams[name].table(f"{self.path}: {name}", self.notes, width)
+
+
+def _normal(path: Path, got: _Gathered, title: str, record_start_s: float) -> Log:
+    topics, notes, streams = got.topics, got.notes, got.streams
     odometry = attitude = imu = gnss = height = frames = None
-    if topic and streams[topic].rows:
-        t, rows = streams[topic].table(f"{path}: {topic}", notes, 7)
-        odometry = Odometry(t, rows[:, :3], unit(f"{path}: {topic}", rows[:, 3:]), topic)
-        if frame_ids:
-            notes.append(f"{topic}: frames {frame_ids}")
-    if imu_topic and streams[imu_topic].rows:
-        t, rows = streams[imu_topic].table(f"{path}: {imu_topic}", notes, 10)
+    if (poses := got.table(topics.odometry, 7)) is not None:
+        t, rows = poses
+        name = str(topics.odometry)
+        odometry = Odometry(t, rows[:, :3], unit(f"{path}: {name}", rows[:, 3:]), name)
+        if got.frame_ids:
+            notes.append(f"{name}: frames {got.frame_ids}")
+    if (inertial := got.table(topics.imu, 10)) is not None:
+        t, rows = inertial
         imu = Imu(t, rows[:, :3], rows[:, 3:6])
         length = np.linalg.norm(rows[:, 6:], axis=1)
         if (np.abs(length - 1.0) < 0.01).all() and not (rows[:, 6:] == [1.0, 0.0, 0.0, 0.0]).all():
-            attitude = Orientation(t, rows[:, 6:] / length[:, None], False, imu_topic)
-    if fix_topic and streams[fix_topic].rows:
-        t, rows = streams[fix_topic].table(f"{path}: {fix_topic}", notes, 4)
+            attitude = Orientation(t, rows[:, 6:] / length[:, None], False, str(topics.imu))
+    if (fixes := got.table(topics.fix, 4)) is not None:
+        t, rows = fixes
         gnss = Gnss(t, rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3])
-    if range_topic and streams[range_topic].rows:
-        t, rows = streams[range_topic].table(f"{path}: {range_topic}", notes, 1)
-        height = Height(t, rows[:, 0], "ground", range_topic)
-    if image_topic and streams[image_topic].rows:
-        t, rows = streams[image_topic].table(f"{path}: {image_topic}", notes, 1)
+    if (ranges := got.table(topics.range, 1)) is not None:
+        t, rows = ranges
+        height = Height(t, rows[:, 0], "ground", str(topics.range))
+    if (shots := got.table(topics.image, 1)) is not None:
+        t, rows = shots
         place = {int(row[0]): i for i, row in enumerate(rows)}  # order of recording -> order of time
-        frames = CameraFrames(
-            t,
-            tuple(f"{i:06d}{suffix}" for i in range(len(t))),
-            lambda: _pictures(path, str(image_topic), place),
-            sizes[0],
-            image_topic,
-        )
+        names = tuple(f"{i:06d}{got.suffix}" for i in range(len(t)))
+        topic = str(topics.image)
+        assert got.size is not None
+        frames = CameraFrames(t, names, lambda: _pictures(path, topic, place), got.size, topic)
     offsets = tuple(
         (name, float(np.median(np.array(s.stamps) - np.array(s.recorded))))
         for name, s in streams.items()
         if s.rows
     )
-    stamp = min((min(s.stamps) for s in streams.values() if s.rows), default=record_start)
+    stamp = min((min(s.stamps) for s in streams.values() if s.rows), default=record_start_s)
+    clock = (
+        "Unix time (header.stamp)" if stamp > 1e8 else "header.stamp, from the start of a robot or simulation"
+    )
     return Log(
-        "rosbag",
-        title,
-        "Unix time (header.stamp)"
-        if stamp > 1e8
-        else "header.stamp, from the start of a robot or simulation",
-        odometry,
-        candidates=tuple(poses | links),
+        kind="rosbag",
+        title=title,
+        clock=clock,
+        odometry=odometry,
+        candidates=topics.candidates,
         imu=imu,
         height=height,
         attitude=attitude,
         gnss=gnss,
         frames=frames,
-        camera=camera,
+        camera=got.camera,
         stamp_offset_s=offsets,
         notes=tuple(notes),
     )

@@ -1,4 +1,4 @@
-"""Text odometry in, with the dialect found out where it is not stated; reading itself is in ``brmgeo.flight.odometry``."""
+"""Text odometry in, with the dialect found out where it is not stated; reading itself is in ``brmgeo.flight.poses``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from brmgeo.errors import FlightError
 from brmgeo.flight.frames import QuaternionOrder, likely_order
 from brmgeo.flight.logs.values import Log, LogOptions
-from brmgeo.flight.odometry import OdometryOptions, read_odometry
+from brmgeo.flight.poses import OdometryOptions, read_poses
 from brmgeo.flight.tables import number, read_rows, read_text
 
 _OWN_ORDER: dict[str, QuaternionOrder] = {
@@ -50,7 +50,7 @@ def text_format(path: Path) -> str:
 
 
 def read_text_log(path: Path, options: LogOptions | None = None) -> Log:
-    """The poses of a text file. Raises FlightError as ``read_odometry`` does."""
+    """The poses of a text file. Raises FlightError as ``read_poses`` does."""
     options = options or LogOptions()
     kind = options.format or text_format(path)
     notes: list[str] = []
@@ -63,12 +63,12 @@ def read_text_log(path: Path, options: LogOptions | None = None) -> Log:
         if order is None and options.any_topic and likely not in (None, own):
             faults.append(
                 f"as {own}, the order of {kind}, the aircraft would tumble; its columns look like {likely}: "
-                f"give --quaternion {likely}"
+                f"give quaternion {likely}"
             )
             order = likely
         seen = likely or "cannot be told from these turns"
         notes.append(f"quaternion read as {order or own}; likely order: {seen}")
-    odometry = read_odometry(path, kind, OdometryOptions(order, options.frame_times_s, own_times=True))
+    odometry = read_poses(path, kind, OdometryOptions(order, options.frame_times_s, own_times=True))
     rows = len([line for line in read_text(path).splitlines() if line.strip() and line.strip()[0] != "#"])
     dropped = rows - len(odometry.t_s) - (kind == "csv")
     if dropped:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.extras import extra
 from brmgeo.flight.frames import (
     enu_flu_from_ned_frd,
     enu_from_ned,
@@ -28,7 +29,7 @@ from brmgeo.flight.logs.values import (
     LogOptions,
     Orientation,
     choose,
-    missing_library,
+    mixed,
     unit,
 )
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
@@ -43,13 +44,11 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
     """The streams of a PX4 log that a flight needs.
 
     Raises FlightError for files that are no ULog or break off before the first data, and an odometry asked for that
-    is not there; MissingInputError without the package pyulog. Dropouts and resets are told in the result.
+    is not there; MissingExtraError without the package pyulog. Dropouts and resets are told in the result.
     """
     options = options or LogOptions()
-    try:
+    with extra("logs", "reading PX4 logs"):
         from pyulog import ULog
-    except ImportError:
-        raise missing_library(path, "PX4 logs", "pyulog") from None
     if not path.is_file():
         raise MissingInputError(f"{path}: the log is missing")
     said = io.StringIO()
@@ -86,7 +85,7 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
 def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], options: LogOptions) -> Log:
     found = {name: len(sets[name]["timestamp"]) for name in _STREAMS if name in sets and _usable(name, sets)}
     # Several are the rule, and they are one estimator's words: the first in order of worth is the choice.
-    stream = choose(path, "odometry", "--topic", options.topic, found, any_topic=True)
+    stream = choose(path, "odometry", options.topic, found, needs="topic", any_topic=True)
     odometry: Odometry | None = None
     resets: list[tuple[float, str]] = []
     faults: list[str] = []
@@ -256,18 +255,6 @@ def _local_position(
     return Odometry(
         t, xyz, mixed(ta, unit(f"{path}: vehicle_attitude", wxyz), t), "vehicle_local_position", segment
     ), resets
-
-
-def mixed(t_s: FloatArray, wxyz: FloatArray, at_s: FloatArray) -> FloatArray:
-    """(m, 4) attitudes at ``at_s``, between neighbours by the straight mean (nlerp): they lie milliseconds apart."""
-    if len(t_s) == 1:
-        return np.repeat(wxyz, len(at_s), axis=0)
-    right = np.clip(np.searchsorted(t_s, at_s), 1, len(t_s) - 1)
-    share = np.clip((at_s - t_s[right - 1]) / (t_s[right] - t_s[right - 1]), 0.0, 1.0)[:, None]
-    first, second = wxyz[right - 1], wxyz[right]
-    second = np.where((first * second).sum(axis=1, keepdims=True) < 0.0, -second, second)
-    between = (1.0 - share) * first + share * second
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
 
 
 def _imu(sets: dict[str, Data]) -> Imu | None:

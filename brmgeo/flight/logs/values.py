@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.errors import FlightError
 from brmgeo.flight.frames import QuaternionOrder
 from brmgeo.flight.readings import Camera, FloatArray, Imu, Odometry
+from brmgeo.pictures import SUFFIXES
 
 #: Stamps of one stream that go back by more than this are a clock that jumped, not messages that overtook each other.
 MAX_REORDER_S = 0.5
+#: Endings of the files that count as photos of a camera.
+PHOTO_SUFFIXES = (*SUFFIXES, ".dng")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +133,6 @@ class Log:
     faults: tuple[str, ...] = ()
 
 
-def missing_library(path: object, what: str, package: str) -> MissingInputError:
-    """The error for a log whose library is not installed."""
-    return MissingInputError(
-        f"{path}: reading {what} needs the package {package}: pip install 'brmgeo[logs]' (or pip install {package})"
-    )
-
-
 def ordered(where: str, t_s: FloatArray, notes: list[str]) -> NDArray[np.int64]:
     """Indices that put stamps in order, each once (the last of equal ones); what was mended goes to ``notes``.
 
@@ -177,20 +173,34 @@ def unit(where: str, wxyz: FloatArray) -> FloatArray:
     return np.asarray(wxyz / length[:, None])
 
 
+def mixed(t_s: FloatArray, wxyz: FloatArray, at_s: FloatArray) -> FloatArray:
+    """(m, 4) attitudes at ``at_s``, between neighbours by the straight mean (nlerp): they lie milliseconds apart."""
+    if len(t_s) == 1:
+        return np.repeat(wxyz, len(at_s), axis=0)
+    right = np.clip(np.searchsorted(t_s, at_s), 1, len(t_s) - 1)
+    share = np.clip((at_s - t_s[right - 1]) / (t_s[right] - t_s[right - 1]), 0.0, 1.0)[:, None]
+    first, second = wxyz[right - 1], wxyz[right]
+    second = np.where((first * second).sum(axis=1, keepdims=True) < 0.0, -second, second)
+    between = (1.0 - share) * first + share * second
+    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
+
+
 def choose(
-    path: object, what: str, option: str, wanted: str | None, found: dict[str, int], any_topic: bool
+    path: object, what: str, wanted: str | None, found: dict[str, int], *, needs: str, any_topic: bool
 ) -> str | None:
     """The stream to take of ``found`` (name -> messages); None when there is none.
 
-    Raises FlightError that lists the candidates when ``wanted`` is not there or several are.
+    Raises FlightError that lists the candidates when ``wanted`` is not there or several are; ``needs`` is the option of
+    ``LogOptions`` that chooses.
     """
     listed = ", ".join(f"{name} ({count})" for name, count in found.items())
     if wanted is not None:
         if wanted in found:
             return wanted
         raise FlightError(
-            f"{path}: no {what} named {wanted!r}: there {'is ' + listed if listed else 'is none'}"
+            f"{path}: no {what} named {wanted!r}: there {'is ' + listed if listed else 'is none'}",
+            needs=needs,
         )
     if len(found) > 1 and not any_topic:
-        raise FlightError(f"{path}: {len(found)} streams hold {what}: choose one with {option}: {listed}")
+        raise FlightError(f"{path}: {len(found)} streams hold {what}: choose one of {listed}", needs=needs)
     return next(iter(found), None)
