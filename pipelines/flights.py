@@ -33,13 +33,12 @@ from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, rend
 from brmgeo.evaluate.scores import FALSE_FIX_M, Scores, dead_reckoning, score, travelled_m
 from brmgeo.evaluate.sift import SiftFix, SiftMatcher
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
-from brmgeo.export.cog import box_of, read_overview, read_window
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.motion import RESET_SPEED_M_S, motions
 from brmgeo.flight.readings import Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
-from brmgeo.geo.grid import bounds_of, gsd_of
+from brmgeo.geo.raster import box_of, read_overview, read_raster
 from brmgeo.match import (
     METHODS,
     GroundMap,
@@ -107,15 +106,13 @@ def read_maps(folder: Path) -> Maps:
 @functools.lru_cache(maxsize=2)
 def _read_maps(folder: Path, changed_ns: int) -> Maps:
     # The time of the last change is in the key, so that maps built anew are read anew.
-    path = folder / "buildings.tif"
-    box = box_of(path)
-    left, _, _, top = bounds_of(box)
-    ground = GroundMap(read_window(path)[0], left, top, gsd_of(box))
+    buildings = read_raster(folder / "buildings.tif")
+    ground = GroundMap(buildings.pixels[0], buildings.left, buildings.top, buildings.gsd_m)
     imagery, footprints = folder / "imagery.tif", folder / "footprints.gpkg"
     return Maps(
         folder,
         ground,
-        str(box.crs),
+        buildings.crs,
         imagery if imagery.is_file() else None,
         footprints if footprints.is_file() else None,
     )
@@ -787,9 +784,8 @@ def _imagery_of(own: FlightSettings, route: FloatArray, native: NativeImagery | 
         reach = own.agl_m * math.tan(math.radians(own.fov_deg) / 2) * 2.5 + 60.0
         (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
         return Imagery(*native.around((left, bottom, right, top)), native.gsd_m)
-    box = box_of(file)
-    left, _, _, top = bounds_of(box)
-    return Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
+    picture = read_raster(file)
+    return Imagery(np.moveaxis(picture.pixels, 0, -1), picture.left, picture.top, picture.gsd_m)
 
 
 def _simulate_one(job: tuple[Simulation, int, Path, str]) -> Path:

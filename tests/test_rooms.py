@@ -43,6 +43,7 @@ KERNELS = {
     "brmgeo.segment.alignment",
 }
 ADAPTERS = {
+    "brmgeo.geo.raster",
     "brmgeo.ingest",
     "brmgeo.export",
     "brmgeo.flight.folder",
@@ -61,6 +62,7 @@ MAY_KNOW = {
     "brmgeo.extras": {"brmgeo.errors"},
     "brmgeo.region": FOUNDATION,
     "brmgeo.geo": FOUNDATION,
+    "brmgeo.geo.raster": {"brmgeo.codes", "brmgeo.errors", "brmgeo.geo.grid"},
     "brmgeo.flight.values": set[str](),
     "brmgeo.maps": VALUES,
     "brmgeo.match": VALUES | {"brmgeo.maps.ratio", "brmgeo.flight.view"},
