@@ -322,18 +322,15 @@ def score(result: VioResult, truth: Any, yaw: Any, seconds: float) -> dict[str, 
 
 
 def read_demo() -> tuple[Imagery, Any]:
-    from brmgeo.export.cog import box_of, read_window
-    from brmgeo.geo.grid import bounds_of, gsd_of
+    from brmgeo.geo.raster import read_raster
     from pipelines.flights import read_ground
 
     folder = ROOT / "data" / "out" / "demo"
     if not (folder / "imagery.tif").is_file():
         sys.exit("data/out/demo is not there: run `make maps` first")
-    path = folder / "imagery.tif"
-    box = box_of(path)
-    left, _, _, top = bounds_of(box)
-    rgb = np.ascontiguousarray(np.moveaxis(read_window(path), 0, -1))
-    return Imagery(rgb, left, top, gsd_of(box)), read_ground(folder / "footprints.gpkg")
+    drawn = read_raster(folder / "imagery.tif")
+    rgb = np.ascontiguousarray(np.moveaxis(drawn.pixels, 0, -1))
+    return Imagery(rgb, drawn.left, drawn.top, drawn.gsd_m), read_ground(folder / "footprints.gpkg")
 
 
 def main() -> None:

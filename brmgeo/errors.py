@@ -10,6 +10,11 @@ The library knows no command line. Where a parameter would mend the fault, ``nee
 from __future__ import annotations
 
 
+def one_line(error: BaseException, most: int = 300) -> str:
+    """What an error says, on one line of at most ``most`` characters; its type's name where it says nothing."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
 class BrmgeoError(Exception):
     """Root of all errors that the user's input or machine can cause.
 

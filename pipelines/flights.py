@@ -33,12 +33,11 @@ from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, rend
 from brmgeo.evaluate.scores import FALSE_FIX_M, Scores, dead_reckoning, score, travelled_m
 from brmgeo.evaluate.sift import SiftFix, SiftMatcher
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
-from brmgeo.export.cog import box_of, read_overview, read_window
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.readings import Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
-from brmgeo.geo.grid import bounds_of, gsd_of
+from brmgeo.geo.raster import box_of, read_overview, read_raster
 from brmgeo.locate.live import Located, locate, motions_of, view_at
 from brmgeo.locate.maps import Maps, match_settings, read_maps
 from brmgeo.locate.masks import (
@@ -666,9 +665,8 @@ def _imagery_of(own: FlightSettings, route: FloatArray, native: NativeImagery | 
         reach = own.agl_m * math.tan(math.radians(own.fov_deg) / 2) * 2.5 + 60.0
         (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
         return Imagery(*native.around((left, bottom, right, top)), native.gsd_m)
-    box = box_of(file)
-    left, _, _, top = bounds_of(box)
-    return Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
+    picture = read_raster(file)
+    return Imagery(np.moveaxis(picture.pixels, 0, -1), picture.left, picture.top, picture.gsd_m)
 
 
 def _simulate_one(job: tuple[Simulation, int, Path, str]) -> Path:

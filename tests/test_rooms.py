@@ -43,6 +43,7 @@ KERNELS = {
     "brmgeo.segment.alignment",
 }
 ADAPTERS = {
+    "brmgeo.geo.raster",
     "brmgeo.ingest",
     "brmgeo.export",
     "brmgeo.flight.folder",
@@ -62,6 +63,7 @@ MAY_KNOW = {
     "brmgeo.extras": {"brmgeo.errors"},
     "brmgeo.region": FOUNDATION,
     "brmgeo.geo": FOUNDATION,
+    "brmgeo.geo.raster": {"brmgeo.codes", "brmgeo.errors", "brmgeo.geo.grid"},
     "brmgeo.flight.values": set[str](),
     "brmgeo.maps": VALUES,
     "brmgeo.match": VALUES | {"brmgeo.maps.ratio", "brmgeo.flight.view"},
@@ -71,7 +73,7 @@ MAY_KNOW = {
     "brmgeo.evaluate": VALUES,
     "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
     "brmgeo.segment": VALUES | {"brmgeo.maps"},
-    "brmgeo.locate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.segment", "brmgeo.export.cog"},
+    "brmgeo.locate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.segment"},
     "brmgeo.workflow": FOUNDATION | {"brmgeo"},
 }
 # Libraries that live in one room only.

@@ -1,4 +1,4 @@
-"""Rasters out: how every GeoTIFF of brmgeo is written, and the few helpers that read one back.
+"""Rasters out: how every GeoTIFF of brmgeo is written. ``geo.raster`` reads them back.
 
 A raster is written as a cloud-optimised GeoTIFF (COG) in two steps, because overviews need the finished pixels: blocks go,
 in any order, into a tiled scratch file beside the result, and one pass of GDAL's COG driver lays down overviews and
@@ -41,19 +41,16 @@ import rasterio.windows
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from rasterio._err import CPLE_BaseError
-from rasterio.enums import Resampling
-from rasterio.errors import RasterioError, RasterioIOError
+from rasterio.errors import RasterioError
 
-from brmgeo.errors import InputError, MissingInputError, WorkflowError
+from brmgeo.codes import RATIO_SCALE, RATIO_UNKNOWN, UNKNOWN
+from brmgeo.errors import WorkflowError, one_line
 from brmgeo.geo.grid import Window, blocks
 
 Kind = Literal["mask", "ratio", "imagery"]
 Rgb = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 Block = NDArray[Any] | Rgb
 
-MASK_UNKNOWN = 255
-RATIO_SCALE = 1e-4
-RATIO_UNKNOWN = 65535
 BLOCK_PX = 512
 # Blocks of whole arrays: a multiple of BLOCK_PX, small enough that counting values needs little memory.
 _SLICE_PX = 2048
@@ -142,7 +139,7 @@ def write_cog(
                 dtype=dtype,
                 crs=_rasterio_crs(box),
                 transform=box.affine,
-                nodata={"mask": MASK_UNKNOWN, "ratio": RATIO_UNKNOWN, "imagery": None}[kind],
+                nodata={"mask": UNKNOWN, "ratio": RATIO_UNKNOWN, "imagery": None}[kind],
                 tiled=True,
                 blockxsize=BLOCK_PX,
                 blockysize=BLOCK_PX,
@@ -206,13 +203,6 @@ def encode_ratio(ratio: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
     return out
 
 
-def decode_ratio(stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """float32 ratios in [0, 1], NaN where unknown, from the stored uint16 steps."""
-    out = (stored * RATIO_SCALE).astype(np.float32)
-    out[stored == RATIO_UNKNOWN] = np.nan
-    return out
-
-
 def output_tags(stage_key: str, region: str, attribution: str = "", terms: str = "") -> dict[str, str]:
     """The file metadata that every result carries; empty ones are left out."""
     tags = {
@@ -223,83 +213,6 @@ def output_tags(stage_key: str, region: str, attribution: str = "", terms: str =
         "SOFTWARE": "brmgeo",
     }
     return {name: value for name, value in tags.items() if value}
-
-
-def box_of(path: Path) -> GeoBox:
-    """The lattice of a raster; raises MissingInputError or InputError where there is no readable, placed raster."""
-    with _opened(path) as src:
-        if src.crs is None:
-            raise InputError(f"{path} has no coordinate reference system: it was not written by brmgeo")
-        return GeoBox(
-            src.shape, src.transform, src.crs.to_wkt() if src.crs.to_epsg() is None else str(src.crs)
-        )
-
-
-def radii_of(path: Path) -> tuple[float, ...]:
-    """Radius of each band of a ratio raster, metres; raises InputError where the raster does not state them."""
-    with _opened(path) as src:
-        try:
-            return tuple(float(src.tags(band)["radius_m"]) for band in src.indexes)
-        except (KeyError, ValueError):
-            raise InputError(
-                f"{path} is no ratio raster: its bands state no radius_m; run `brmgeo maps`"
-            ) from None
-
-
-def read_window(path: Path, window: Window | None = None, bands: Sequence[int] | None = None) -> NDArray[Any]:
-    """Stored values of a window as (bands, h, w) in the file's dtype; the whole raster by default.
-
-    ``bands`` counts from 1. Where the window reaches outside the raster the values are the raster's nodata (0 for imagery).
-    Raises MissingInputError or InputError where the raster cannot be read.
-    """
-    with _opened(path) as src:
-        wanted = window or Window(0, 0, src.height, src.width)
-        index = list(bands) if bands is not None else list(src.indexes)
-        fill = 0 if src.nodata is None else src.nodata
-        out = np.full((len(index), wanted.height, wanted.width), fill, dtype=src.dtypes[0])
-        r0, c0 = max(0, wanted.row), max(0, wanted.col)
-        r1, c1 = min(src.height, wanted.row + wanted.height), min(src.width, wanted.col + wanted.width)
-        if r1 > r0 and c1 > c0:
-            inner = rasterio.windows.Window(c0, r0, c1 - c0, r1 - r0)
-            rows, cols = (
-                slice(r0 - wanted.row, r1 - wanted.row),
-                slice(c0 - wanted.col, c1 - wanted.col),
-            )
-            try:
-                out[:, rows, cols] = src.read(index, window=inner)
-            except (RasterioError, CPLE_BaseError, IndexError) as error:
-                raise InputError(f"{path} is damaged or has not these bands: {_one_line(error)}") from error
-        return out
-
-
-def read_overview(path: Path, most_px: int) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
-    """The whole raster at most ``most_px`` on its longer side, from its overviews: (bands, h, w), and its bounds.
-
-    Bounds are (left, bottom, right, top) in the raster's CRS. Masks are picked, pictures averaged, so that a mask keeps its
-    values. Raises MissingInputError or InputError where the raster cannot be read.
-    """
-    with _opened(path) as src:
-        shrink = max(1.0, max(src.height, src.width) / most_px)
-        shape = (src.count, max(1, round(src.height / shrink)), max(1, round(src.width / shrink)))
-        how = Resampling.average if src.count == 3 else Resampling.nearest
-        try:
-            pixels = src.read(out_shape=shape, resampling=how)
-        except RasterioError as error:
-            raise InputError(f"{path} is damaged: {_one_line(error)}") from error
-        return pixels, (src.bounds.left, src.bounds.bottom, src.bounds.right, src.bounds.top)
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """A raster opened for reading, with rasterio's error turned into ours."""
-    if not Path(path).is_file():
-        raise MissingInputError(f"there is no raster {path}: run `brmgeo maps` first")
-    try:
-        src = rasterio.open(path)
-    except RasterioIOError as error:
-        raise InputError(f"{path} is not a readable raster: {_one_line(error)}") from error
-    with src:
-        yield src
 
 
 def _sliced(data: Block, shape: tuple[int, int]) -> Iterator[tuple[Window, Block]]:
@@ -339,7 +252,7 @@ def _checked(
     if values.shape != (count, window.height, window.width) or values.dtype != wanted:
         raise ValueError(f"a block of {values.shape} {values.dtype} does not fit {count} bands of {window}")
     top = {"mask": 1, "ratio": round(1 / RATIO_SCALE), "imagery": 255}[kind]
-    unknown = {"mask": MASK_UNKNOWN, "ratio": RATIO_UNKNOWN, "imagery": -1}[kind]
+    unknown = {"mask": UNKNOWN, "ratio": RATIO_UNKNOWN, "imagery": -1}[kind]
     if kind != "imagery" and ((values > top) & (values != unknown)).any():
         raise ValueError(f"a {kind} holds values over {top} that are not {unknown} (unknown)")
     return values, valid
@@ -442,7 +355,7 @@ def _gdal(path: Path) -> Iterator[None]:
 
 def _unwritable(path: Path, error: OSError) -> WorkflowError:
     """One line: which file, why, and what to do."""
-    reason = error.strerror or _one_line(error)
+    reason = error.strerror or one_line(error)
     lowered = reason.lower()
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     if full or any(words in lowered for words in ("no space", "quota", "too large")):
@@ -464,10 +377,6 @@ def _check_space(path: Path, need: int) -> None:
         raise OSError(errno.ENOSPC, found)
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300]
-
-
 def _check_writable(part: Path) -> None:
     """Fails early, with the system's own reason, where nothing can be written."""
     with open(part, "wb"):
@@ -487,7 +396,7 @@ def _check_complete(part: Path, path: Path) -> None:
             start = src.get_tag_item(f"BLOCK_OFFSET_{last_x}_{last_y}", "TIFF", bidx=1)
             length = src.get_tag_item(f"BLOCK_SIZE_{last_x}_{last_y}", "TIFF", bidx=1)
     except (RasterioError, CPLE_BaseError) as error:
-        raise _unwritable(path, OSError(_one_line(error))) from error
+        raise _unwritable(path, OSError(one_line(error))) from error
     # A block of nodata only may be left out of the file; then there is nothing to check.
     if start is not None and length is not None and size < int(start) + int(length):
         raise _unwritable(path, OSError(f"the file ends at byte {size}, before its last block"))

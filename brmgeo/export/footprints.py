@@ -12,7 +12,7 @@ import geopandas as gpd
 import numpy as np
 import pyogrio
 
-from brmgeo.errors import WorkflowError
+from brmgeo.errors import WorkflowError, one_line
 
 # GeoPackages carry the time of their writing; a fixed one keeps equal contents equal in bytes.
 _DATE = "2000-01-01T00:00:00Z"
@@ -79,7 +79,7 @@ def write_footprints_gpkg(
         database.close()
         os.replace(draft, path)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, sqlite3.Error, OSError) as error:
-        reason = " ".join(str(error).split())[:160]
+        reason = one_line(error, 160)
         raise WorkflowError(
             f"{path}: the footprints cannot be written ({reason}): check space and rights"
         ) from error

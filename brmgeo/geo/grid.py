@@ -9,13 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
 from brmgeo.errors import SettingsError
+
+if TYPE_CHECKING:
+    # odc-geo brings xarray and pandas with it: only what makes a lattice imports it.
+    from odc.geo.geobox import GeoBox
 
 Bounds = tuple[float, float, float, float]
 
@@ -25,6 +29,8 @@ def lattice(bounds: Bounds, crs: str, gsd_m: float) -> GeoBox:
 
     Raises SettingsError for empty or non-finite bounds.
     """
+    from odc.geo.geobox import GeoBox
+
     left, bottom, right, top = bounds
     if not all(map(math.isfinite, bounds)) or not (right > left and top > bottom) or not gsd_m > 0:
         raise SettingsError(
@@ -79,7 +85,7 @@ class Window:
     def box_in(self, box: GeoBox) -> GeoBox:
         """This window's own lattice; also where it reaches outside ``box``."""
         affine = box.affine @ Affine.translation(self.col, self.row)
-        return GeoBox((self.height, self.width), affine, box.crs)
+        return type(box)((self.height, self.width), affine, box.crs)
 
     @property
     def slices(self) -> tuple[slice, slice]:

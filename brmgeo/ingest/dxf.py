@@ -37,7 +37,7 @@ from ezdxf.filemanagement import readfile
 from ezdxf.math import OCS
 from numpy.typing import NDArray
 
-from brmgeo.errors import InputError, SettingsError
+from brmgeo.errors import InputError, SettingsError, one_line
 from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings
 
 KIND_OF_LAYER: dict[str, str] = {
@@ -209,7 +209,7 @@ def _dxf_text(path: Path) -> bytes:
             stream = io.StringIO()
             readfile(path).write(stream)
         except Exception as error:  # ezdxf raises many kinds on damaged binary files
-            reason = " ".join(str(error).split())[:120]
+            reason = one_line(error, 120)
             raise InputError(
                 f"{path.name}: binary DXF, damaged or cut short ({reason}): export the sheet again"
             ) from error

@@ -27,7 +27,7 @@ import pyogrio
 import shapely
 from numpy.typing import NDArray
 
-from brmgeo.errors import CrsError, InputError, MissingInputError
+from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
@@ -393,7 +393,7 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
     except InputError:
         raise
     except Exception as error:  # GDAL, pyarrow and geopandas raise many kinds on damaged files
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         if "not recognized as being in a supported file format" in reason:
             reason = "no format that GDAL knows"
         elif len(reason) > 160:

@@ -36,7 +36,7 @@ from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-from brmgeo.errors import CrsError, InputError, MissingInputError
+from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.geo.crs import belt_for_sheet, crs_name, parse_crs, same_crs, transform_bounds, transformer
 from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
@@ -263,7 +263,7 @@ class _FilePlane:
             valid = self.src.dataset_mask(window=target) > 0
         except (RasterioError, CPLE_BaseError) as error:
             raise InputError(
-                f"{self.source.path} is damaged: {_one_line(error)}; fetch or export it again"
+                f"{self.source.path} is damaged: {one_line(error)}; fetch or export it again"
             ) from error
         if self.palette is not None:
             colours = self.palette[values[0]]
@@ -293,7 +293,7 @@ def _plane_of(source: ImagerySource) -> Iterator[_Plane]:
             src = rasterio.open(path)
         except (RasterioError, CPLE_BaseError) as error:
             raise InputError(
-                f"{path} is not a readable image ({_one_line(error)}); fetch or export it again"
+                f"{path} is not a readable image ({one_line(error)}); fetch or export it again"
             ) from error
     with src:
         placed = not src.transform.is_identity
@@ -598,7 +598,3 @@ def _is_world_file(path: Path) -> bool:
     """Whether a file is a world file by its extension: tfw, jgw, pgw, wld, or the image's own with a w."""
     ext = path.suffix.lower().lstrip(".")
     return ext == "wld" or (ext.endswith("w") and len(ext) in (3, 4, 5) and ext != "raw")
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300]

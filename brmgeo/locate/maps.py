@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brmgeo.errors import MissingInputError
-from brmgeo.export.cog import box_of, read_window
-from brmgeo.geo.grid import bounds_of, gsd_of
+from brmgeo.geo.raster import read_raster
 from brmgeo.match import GroundMap, MatchSettings, OdometrySettings, PaperSettings
 from brmgeo.region import FlightSettings
 
@@ -44,15 +43,13 @@ def read_maps(folder: Path) -> Maps:
 @functools.lru_cache(maxsize=2)
 def _read_maps(folder: Path, changed_ns: int) -> Maps:
     # The time of the last change is in the key, so that maps built anew are read anew.
-    path = folder / "buildings.tif"
-    box = box_of(path)
-    left, _, _, top = bounds_of(box)
-    ground = GroundMap(read_window(path)[0], left, top, gsd_of(box))
+    buildings = read_raster(folder / "buildings.tif")
+    ground = GroundMap(buildings.pixels[0], buildings.left, buildings.top, buildings.gsd_m)
     imagery, footprints = folder / "imagery.tif", folder / "footprints.gpkg"
     return Maps(
         folder,
         ground,
-        str(box.crs),
+        buildings.crs,
         imagery if imagery.is_file() else None,
         footprints if footprints.is_file() else None,
     )

@@ -11,24 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 from rio_cogeo import cog_validate
 
-from brmgeo.errors import InputError, MissingInputError, WorkflowError
-from brmgeo.export.cog import (
-    box_of,
-    decode_ratio,
-    encode_ratio,
-    output_tags,
-    radii_of,
-    read_window,
-    write_cog,
-)
+from brmgeo.errors import InputError, WorkflowError
+from brmgeo.export.cog import encode_ratio, output_tags, write_cog
 from brmgeo.geo.grid import Window, blocks, lattice
+from brmgeo.geo.raster import box_of, decode_ratio, radii_of, read_window
 
 BOX = lattice((164000.0, 563000.0, 164700.0, 563600.5), "EPSG:5187", 0.5)
 ROWS, COLS = BOX.shape
@@ -214,22 +207,6 @@ def test_ratio_encoding_keeps_every_step() -> None:
             encode_ratio(np.array([bad]))
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(-30, ROWS + 30), st.integers(-30, COLS + 30), st.integers(1, 80), st.integers(1, 80))
-def test_windows_outside_are_unknown(
-    tmp_path_factory: pytest.TempPathFactory, row: int, col: int, height: int, width: int
-) -> None:
-    """A window is the crop of the raster padded with its nodata."""
-    r, c = np.mgrid[0:ROWS, 0:COLS]
-    whole = ((r * 3 + c * 2) % 10001).astype(np.uint16)
-    path = tmp_path_factory.getbasetemp() / "windows.tif"
-    if not path.exists():
-        write_cog(path, whole[None], BOX, kind="ratio", radii_m=[1.0])
-    padded = np.pad(whole, 120, constant_values=65535)
-    want = padded[row + 120 : row + 120 + height, col + 120 : col + 120 + width]
-    np.testing.assert_array_equal(read_window(path, Window(row, col, height, width), [1])[0], want)
-
-
 def test_small_raster_and_all_unknown(tmp_path: Path) -> None:
     """A raster smaller than a block, and one that knows nothing: valid files without statistics."""
     box = lattice((0.0, 0.0, 10.0, 7.0), "EPSG:5186", 1.0)
@@ -359,25 +336,6 @@ def test_unwritable_folder(tmp_path: Path, ratio: NDArray[np.uint16]) -> None:
         with pytest.raises(WorkflowError, match="Permission denied"):
             write_cog(tmp_path / "a.tif", ratio, BOX, kind="ratio", radii_m=RADII)
         tmp_path.chmod(0o700)
-
-
-def test_reading_refuses(tmp_path: Path, ratio: NDArray[np.uint16]) -> None:
-    """Absent, junk, truncated and foreign rasters are told apart."""
-    with pytest.raises(MissingInputError, match=r"no\.tif"):
-        read_window(tmp_path / "no.tif")
-    (tmp_path / "junk.tif").write_bytes(b"junk")
-    with pytest.raises(InputError, match="not a readable raster"):
-        box_of(tmp_path / "junk.tif")
-    path = tmp_path / "r.tif"
-    write_cog(path, ratio, BOX, kind="ratio", radii_m=RADII)
-    (tmp_path / "cut.tif").write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match=r"cut\.tif"):
-        read_window(tmp_path / "cut.tif")
-    with pytest.raises(InputError, match="bands"):
-        read_window(path, bands=[7])
-    write_cog(tmp_path / "m.tif", np.zeros((ROWS, COLS), np.uint8), BOX, kind="mask")
-    with pytest.raises(InputError, match="no ratio raster"):
-        radii_of(tmp_path / "m.tif")
 
 
 @pytest.mark.slow
