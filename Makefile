@@ -11,7 +11,7 @@ STAMP  := $(VENV)/.installed
 BRMGEO := $(BIN)/brmgeo
 export SCHEDULER
 
-.PHONY: help setup maps tiles train status localize evaluate demo test test-slow qgis-test bench bench-odometry lint check clean
+.PHONY: help setup maps tiles train status localize evaluate demo test test-slow qgis-test docs bench bench-odometry lint check clean
 
 help:  ## List these commands
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-14s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -55,6 +55,10 @@ test-slow: setup  ## Run the long tests too
 qgis-test: maps localize  ## Open the demo's QGIS projects in a real QGIS, check and render them (needs qgis, python3-qgis)
 	@/usr/bin/python3 -c 'import qgis.core' 2>/dev/null || { echo "QGIS is not installed: apt-get install qgis python3-qgis"; exit 2; }
 	QT_QPA_PLATFORM=offscreen /usr/bin/python3 tests/qgis/check_qgis.py data/out/$(REGION) --out data/out/$(REGION)/qgis-test
+
+docs: setup  ## Build the documentation site into docs/_build/html; a warning is an error
+	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
 
 bench: setup  ## Measure the kernels against their alternatives and rewrite the tables in docs/
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'

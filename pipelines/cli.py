@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from brmgeo import __version__, files
+from brmgeo import __version__, extras, files
 from brmgeo.errors import BrmgeoError, SettingsError
 
 DATA = click.Path(file_okay=False, path_type=Path)
@@ -1024,6 +1024,12 @@ def run(command: Callable[[], Any]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except ModuleNotFoundError as error:
+        line = extras.told(error, "this command")
+        if line is None:
+            raise
+        click.echo(f"brmgeo: {line}", err=True)
+        return 2
     except OSError as error:
         told = files.reason(error)
         if told is None:

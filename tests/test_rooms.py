@@ -129,10 +129,10 @@ def test_a_room_knows_only_what_the_picture_allows(module: str) -> None:
         return
     room = room_of(module)
     if room is None:
-        assert module == "brmgeo", (
+        # The face names what the rooms offer, and the entry point finds the wiring.
+        assert module in ("brmgeo", "brmgeo.__main__"), (
             f"{module} belongs to no room: add it to docs/ARCHITECTURE.md and to this test"
         )
-        assert not own
         return
     for name in own:
         allowed = inside(name, room) or any(inside(name, other) for other in MAY_KNOW[room])
@@ -159,7 +159,8 @@ def test_libraries_stay_in_their_room(module: str) -> None:
     for library, rooms in ONLY_IN.items():
         if library in top:
             assert any(inside(module, room) for room in rooms), f"{module} imports {library}"
-    assert "pipelines" not in top or inside(module, "pipelines")
+    # The entry point finds the wiring by name, beside the library or below it.
+    assert "pipelines" not in top or inside(module, "pipelines") or module == "brmgeo.__main__"
 
 
 def graph() -> dict[str, set[str]]:
