@@ -10,9 +10,11 @@ import os
 import shutil
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from brmgeo.errors import SettingsError
 
 if sys.platform == "win32":
     import msvcrt
@@ -120,6 +122,25 @@ def whole_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def require_replaceable(out: Path, sign: str, what: str, ours: Callable[[Path], bool]) -> None:
+    """Raises SettingsError where ``whole_folder(out)`` would lose what is not ours.
+
+    Args:
+        out: the folder; one that is not there, or is empty, may be replaced.
+        sign: name of the file without which the folder is none of ours.
+        what: what ours is called, for the message.
+        ours: True for a path in it that may be lost.
+    """
+    there = sorted(out.iterdir()) if out.is_dir() else []
+    foreign = [p for p in there if not ours(p)] or ([] if not there or (out / sign).is_file() else there)
+    if foreign or out.is_file():
+        raise SettingsError(
+            f"{out}: there are other files than {what} ({(foreign or [out])[0].name}), and the folder is replaced as a "
+            "whole: give a new folder or an empty one",
+            needs="out",
+        )
+
+
 # --- contents ----------------------------------------------------------------------------------------------------
 
 
@@ -129,8 +150,8 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-def digest_of(text: str | bytes) -> str:
-    """SHA-256 of a text (its UTF-8) or of bytes, 64 hexadecimal digits."""
+def digest_of(text: str | bytes | memoryview) -> str:
+    """SHA-256 of a text (its UTF-8) or of bytes, such as ``array.data`` of a contiguous array, 64 hexadecimal digits."""
     return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from brmgeo import files
+from brmgeo.errors import SettingsError
 
 
 def test_a_file_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
@@ -30,6 +31,29 @@ def test_a_file_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     files.write_text(path, "new\n")
     assert path.read_bytes() == b"new\n"
+
+
+def test_a_folder_is_replaced_only_where_all_in_it_is_ours(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def require() -> None:
+        files.require_replaceable(out, "sign.txt", "results", lambda p: p.name in ("sign.txt", "more.txt"))
+
+    require()
+    out.mkdir()
+    require()
+    (out / "more.txt").write_text("ours by its name only")
+    with pytest.raises(SettingsError, match=r"other files than results \(more.txt\)") as told:
+        require()
+    assert told.value.needs == "out"
+    (out / "sign.txt").write_text("")
+    require()
+    (out / "thesis.txt").write_text("years of work")
+    with pytest.raises(SettingsError, match="thesis.txt"):
+        require()
+    out = out / "sign.txt"
+    with pytest.raises(SettingsError, match="sign.txt"):
+        require()
 
 
 def test_json_is_read_back_and_damage_is_none(tmp_path: Path) -> None:
@@ -66,6 +90,7 @@ def test_folders_have_the_mode_that_the_umask_asks_for(tmp_path: Path) -> None:
     code = f"""
 import os, pathlib
 from brmgeo import files
+from brmgeo.errors import SettingsError
 os.umask(0o077)
 with files.whole_folder(pathlib.Path({str(tmp_path / "out")!r})) as scratch:
     files.write_text(scratch / "a", "x")
@@ -97,6 +122,7 @@ def test_a_lock_is_held_against_another_process(tmp_path: Path) -> None:
     code = f"""
 import pathlib
 from brmgeo import files
+from brmgeo.errors import SettingsError
 d = files.open_lock(pathlib.Path({str(path)!r}))
 print(files.take_lock(d, wait=False))
 """
