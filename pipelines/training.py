@@ -28,9 +28,9 @@ from odc.geo.geobox import GeoBox
 from brmgeo.errors import CrsError, InputError, MissingInputError, SettingsError
 from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice
+from brmgeo.pictures import fault_of
 from brmgeo.region import Region, TrainingSettings
 from brmgeo.segment import OTHER, SPLITS, UNKNOWN
-from brmgeo.segment.predict import require_whole
 from brmgeo.segment.samples import blank_unknown
 from brmgeo.segment.shards import (
     FORMAT,
@@ -1012,8 +1012,8 @@ def _decoded(path: Path) -> NDArray[np.uint8]:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    if data.size:
-        require_whole(path, data.tobytes())
+    if data.size and (fault := fault_of(data.tobytes())):
+        raise InputError(f"{path}: {fault}: copy the file again")
     found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if found is None:
         raise InputError(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,9 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.pictures import decode, read_bytes
 from brmgeo.segment.weights import ModelCard
 
 Backend = Literal["onnx", "torch"]
+#: What is handed on of a picture: what is building, or how probable that is.
+Answer = Literal["mask", "probability"]
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 #: A picture's GSD: metres per pixel, or (down, across) where its pixels are not square.
@@ -61,8 +63,9 @@ def picture_of(image: NDArray[Any], name: str = "the image") -> Picture:
     """
     if image.dtype != np.uint8:
         raise InputError(
-            f"{name}: {image.dtype} values; the network takes 8 bits a channel: say which levels are black and white "
-            "(--levels LOW,HIGH), or convert it first (gdal_translate -ot Byte -scale LOW HIGH)"
+            f"{name}: {image.dtype} values; the network takes 8 bits a channel: say which levels are black and white, or "
+            "convert it first (gdal_translate -ot Byte -scale LOW HIGH)",
+            needs="levels",
         )
     if image.ndim == 2:
         image = image[:, :, None]
@@ -87,30 +90,6 @@ def scaled_levels(image: NDArray[Any], low: float, high: float) -> U8:
     return out
 
 
-def require_whole(path: Path, data: bytes) -> None:
-    """Raises InputError, naming the file, for the bytes of a picture that is empty, damaged or cut short."""
-    from io import BytesIO
-
-    from PIL import Image
-
-    if not data:
-        raise InputError(f"{path}: the file is empty: copy it again")
-    # OpenCV fills up what is missing of a JPEG with grey and says nothing; Pillow refuses it.
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large pictures and odd EXIF, which do not matter here
-            with Image.open(BytesIO(data)) as shown:
-                shown.load()
-    except Image.DecompressionBombError:
-        raise InputError(
-            f"{path}: too many pixels for one picture: cut it into parts, or segment it as a georeferenced raster"
-        ) from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
-        if data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error):
-            raise InputError(f"{path}: damaged or cut short ({error}): copy the file again") from None
-
-
 def read_image(path: Path, data: bytes | None = None, levels: tuple[float, float] | None = None) -> Picture:
     """The picture in an image file, sensor's rows and columns (an EXIF turn is not applied).
 
@@ -121,16 +100,7 @@ def read_image(path: Path, data: bytes | None = None, levels: tuple[float, float
     Raises MissingInputError or InputError, naming the file, where it is not there, cut short, damaged, no image, of more
     than 8 bits without ``levels``, or too small.
     """
-    if data is None:
-        if not path.is_file():
-            raise MissingInputError(f"{path}: there is no such image")
-        data = path.read_bytes()
-    require_whole(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path}: the image cannot be decoded: copy it again, or convert it to PNG or JPEG")
-    if image.ndim == 3 and image.shape[2] >= 3:
-        image = image[:, :, [2, 1, 0, 3][: image.shape[2]]]
+    image = decode(read_bytes(path) if data is None else data, str(path))
     if levels is not None and image.dtype != np.uint8:
         alpha = image.ndim == 3 and image.shape[2] in (2, 4)
         seen = scaled_levels(image, *levels)
@@ -299,7 +269,9 @@ class Segmenter:
                 f"{given}: weights are .safetensors or .onnx files; others (such as pickles) are never opened"
             )
         if not given.is_file():
-            raise MissingInputError(f"{given}: there are no such weights; give --weights FILE, or train some")
+            raise MissingInputError(
+                f"{given}: there are no such weights; give a file that is there, or train some", needs="path"
+            )
         threads = threads or _cores()
         graph, tensors = given.with_suffix(".onnx"), given.with_suffix(".safetensors")
         if backend is None:

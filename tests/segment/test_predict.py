@@ -342,14 +342,14 @@ def flipped(path: Path) -> None:
 
 
 BAD_FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "missing": ("a.jpg", lambda p: None, "no such image"),
+    "missing": ("a.jpg", lambda p: None, "no such picture"),
     "empty": ("a.jpg", lambda p: p.write_bytes(b""), "empty"),
-    "text": ("a.jpg", lambda p: p.write_text("no picture at all"), "cannot be decoded"),
+    "text": ("a.jpg", lambda p: p.write_text("no picture at all"), "no picture that can be decoded"),
     "JPEG cut short": ("a.jpg", cut, "cut short"),
     "JPEG without a head": ("a.jpg", headless, "damaged"),
-    "PNG with a flipped byte": ("a.png", flipped, "damaged"),
-    "16 bits": ("a.png", lambda p: cv2.imwrite(str(p), np.full((64, 64, 3), 9000, np.uint16)), "--levels"),
-    "16 bits of grey": ("a.png", lambda p: cv2.imwrite(str(p), np.full((64, 64), 9000, np.uint16)), "--levels"),
+    "PNG with a flipped byte": ("a.png", flipped, "no picture that can be decoded"),
+    "16 bits": ("a.png", lambda p: cv2.imwrite(str(p), np.full((64, 64, 3), 9000, np.uint16)), "levels are black"),
+    "16 bits of grey": ("a.png", lambda p: cv2.imwrite(str(p), np.full((64, 64), 9000, np.uint16)), "levels are black"),
     "tiny": ("a.png", lambda p: cv2.imwrite(str(p), np.zeros((8, 300, 3), np.uint8)), "300 x 8 px"),
 }  # fmt: skip
 
