@@ -769,7 +769,7 @@ def segment(
     looks: int | None,
 ) -> None:
     """Find the buildings in SOURCE: a flight folder, a folder of images, or a georeferenced raster of any size."""
-    from pipelines import masks as job
+    from pipelines import segment as job
 
     if bands is not None and any(b != int(b) for b in bands):
         raise SettingsError(f"segment: --bands {bands} are numbers of bands, from 1")

@@ -53,10 +53,10 @@ from brmgeo.locate.masks import (
 )
 from brmgeo.match import METHODS, GroundMap, MatchSettings, SmoothedPath
 from brmgeo.region import FlightSettings, Region
+from brmgeo.synth.mission import photographed
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
 from pipelines.maps import NativeImagery, native_imagery
-from pipelines.masks import photographed
 from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named, town_style
 

@@ -27,10 +27,9 @@ from brmgeo.flight.camera import level_from_camera
 from brmgeo.flight.folder import Flight
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.pictures import encode
-from brmgeo.segment.predict import Picture, Segmenter, mask_of, picture_of, read_image
+from brmgeo.segment.predict import Answer, Picture, Segmenter, mask_of, picture_of, read_image
 from brmgeo.segment.weights import ModelCard
 
-Answer = Literal["mask", "probability"]
 #: Probabilities as they are kept: 0 to 254 for 0 to 1, ``UNKNOWN`` for unknown.
 STEPS = 254
 #: A network finds roofs, and a roof is seen where its height puts it: its masks are laid onto a plane this high above ground

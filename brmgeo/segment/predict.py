@@ -270,7 +270,8 @@ class Segmenter:
             )
         if not given.is_file():
             raise MissingInputError(
-                f"{given}: there are no such weights; give a file that is there, or train some", needs="weights"
+                f"{given}: there are no such weights; give a file that is there, or train some",
+                needs="weights",
             )
         threads = threads or _cores()
         graph, tensors = given.with_suffix(".onnx"), given.with_suffix(".safetensors")

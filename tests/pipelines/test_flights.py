@@ -5,21 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import geopandas as gpd
 import numpy as np
 import pyogrio
 import pytest
 import rasterio
-import rasterio.features
 import shapely
-from affine import Affine
 from pyproj import Transformer
+from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, bytes_of, edit
 
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
@@ -30,108 +27,11 @@ from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
 from brmgeo.region import FlightSettings
 from pipelines import flights as job
-from pipelines.cli import cli, run
 
-CRS, LEFT, TOP, GSD, ROWS, COLS = "EPSG:5187", 195_000.0, 446_000.0, 0.5, 1000, 1200
-REAL = (
-    Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    / "flight-sheffield"
-)
 RESULTS = {
     "candidates.geojson", "candidates.qml", "trajectory.geojson", "trajectory.gpkg", "trajectory.tum", "trajectory.json",
     "fixes.csv", "metrics.json", "report.html",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Said:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def line(self) -> str:
-        """The one line on stderr that a refusal is; progress goes there too, and does not count."""
-        lines = [line for line in self.err.splitlines() if line.startswith("brmgeo")]
-        assert self.code == 2, self.err
-        assert len(lines) == 1, self.err
-        return lines[0]
-
-
-@pytest.fixture
-def say(capfd: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    def call(*words: object) -> Said:
-        capfd.readouterr()
-        code = run(lambda: cli([str(w) for w in words], standalone_mode=False))
-        got = capfd.readouterr()
-        return Said(code, got.out, got.err)
-
-    return call
-
-
-@pytest.fixture(scope="module")
-def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """600 x 500 m of houses of many sizes and turns, written with other tools than brmgeo's."""
-    folder = tmp_path_factory.mktemp("maps")
-    rng = np.random.default_rng(11)
-    boxes: list[shapely.Polygon] = []
-    while len(boxes) < 260:
-        x, y = LEFT + rng.uniform(10, 590), TOP - rng.uniform(10, 490)
-        box = shapely.box(x, y, x + rng.uniform(7, 22), y + rng.uniform(7, 13))
-        box = shapely.affinity.rotate(box, rng.uniform(0, 90))
-        if not any(box.distance(other) < 3 for other in boxes):
-            boxes.append(box)
-    gpd.GeoDataFrame({"floors": rng.integers(1, 5, len(boxes))}, geometry=boxes, crs=CRS).to_file(
-        folder / "footprints.gpkg", layer="footprints"
-    )
-    affine = Affine(GSD, 0, LEFT, 0, -GSD, TOP)
-    built = rasterio.features.rasterize(boxes, (ROWS, COLS), transform=affine, dtype="uint8")
-    profile = {"driver": "GTiff", "height": ROWS, "width": COLS, "transform": affine, "crs": CRS}
-    with rasterio.open(folder / "buildings.tif", "w", dtype="uint8", count=1, nodata=255, **profile) as dst:
-        dst.write(built, 1)
-    with rasterio.open(folder / "ratio.tif", "w", dtype="uint16", count=1, nodata=65535, **profile) as dst:
-        dst.write(built.astype(np.uint16) * 10000, 1)
-    noise = rng.integers(60, 120, (3, ROWS, COLS), dtype=np.uint8)
-    with rasterio.open(
-        folder / "imagery.tif", "w", dtype="uint8", count=3, photometric="RGB", **profile
-    ) as dst:
-        dst.write(noise + 100 * built)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def waypoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A line of 250 m within the map, in longitude and latitude."""
-    xy = [(LEFT + 200, TOP - 250), (LEFT + 350, TOP - 220), (LEFT + 380, TOP - 320)]
-    lon, lat = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(*zip(*xy, strict=True))
-    path = tmp_path_factory.mktemp("path") / "line.geojson"
-    path.write_text(
-        json.dumps({"type": "LineString", "coordinates": [list(p) for p in zip(lon, lat, strict=True)]})
-    )
-    return path
-
-
-def make_flight(maps: Path, waypoints: Path, out: Path, *words: object) -> Path:
-    given = ["simulate", "--maps", maps, "--out", out, "--path", waypoints, "--mode", "masks", *words]
-    assert run(lambda: cli([str(w) for w in given], standalone_mode=False)) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
-def whole(maps: Path, waypoints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A masks-only flight of some ten frames with all that a flight has; never change it."""
-    out = tmp_path_factory.mktemp("flight") / "f"
-    return make_flight(maps, waypoints, out, "--compass", "--scale-bias", 0.03)
-
-
-@pytest.fixture(scope="module")
-def results(maps: Path, whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What localize wrote of that flight, one folder a method; never change it."""
-    out = tmp_path_factory.mktemp("results")
-    for method in METHODS:
-        words = ["localize", "--maps", maps, "--flight", whole, "--method", method, "--out", out / method]
-        assert run(lambda words=words: cli([str(w) for w in words], standalone_mode=False)) == 0
-    return out
 
 
 @pytest.fixture
@@ -139,19 +39,9 @@ def flight(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "flight"))
 
 
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text, (path, old)
-    path.write_text(text.replace(old, new, 1))
-
-
 def rewrite_rows(path: Path, change: Callable[[list[list[str]]], list[list[str]]]) -> None:
     rows = [line.split(",") for line in path.read_text().splitlines()]
     path.write_text("".join(",".join(row) + "\n" for row in [rows[0], *change(rows[1:])]))
-
-
-def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 # ---------------------------------------------------------------- what localize writes
@@ -710,17 +600,6 @@ def test_hidden_half_of_the_map_is_never_found(maps: Path, tmp_path: Path) -> No
 
 
 # ---------------------------------------------------------------- the real flight
-
-
-@pytest.fixture(scope="module")
-def real_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if not REAL.is_dir():
-        pytest.skip("the real flight is not here (BRMGEO_REAL_DATA)")
-    out = tmp_path_factory.mktemp("real") / "maps"
-    words = ["maps", "--footprints", REAL / "footprints.gpkg", "--crs", "EPSG:32617", "--out", out]
-    words += ["--scheduler", "serial"]
-    assert run(lambda: cli([str(w) for w in words], standalone_mode=False)) == 0
-    return out
 
 
 def registered(maps_dir: Path, pitch_off_deg: float) -> tuple[np.ndarray, np.ndarray]:
