@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import sys
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -55,26 +56,37 @@ def reason_of(number: int) -> str:
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """A scratch path beside ``path`` (same suffix) that takes its place when the block ends without an error.
 
-    The scratch file is removed after an error, so ``path`` holds the whole new file, or what it held before.
+    The scratch file is removed after an error, so ``path`` holds the whole new file, or what it held before. ``durable``
+    waits until the disk has its bytes, or a power cut may leave an empty file under the name.
     """
     scratch = path.with_name(f"{SCRATCH}{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
         yield scratch
+        if durable:
+            with open(scratch, "rb+") as handle:
+                os.fsync(handle.fileno())
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
 
 
+def clear_scratch(folder: Path, *, older_than_s: float = 3600.0, deep: bool = False) -> None:
+    """Removes scratch files that killed runs left in a folder (``deep``: and below it): those untouched for so long."""
+    before = time.time() - older_than_s
+    name = f"{SCRATCH}*"
+    for path in folder.rglob(name) if deep else folder.glob(name):
+        with contextlib.suppress(OSError):  # another process may clear it away just now
+            if path.is_file() and path.stat().st_mtime < before:
+                path.unlink()
+
+
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> None:
     """Writes a file whole; ``durable`` waits until the disk has it."""
-    with whole_file(path) as scratch, open(scratch, "wb") as handle:
-        handle.write(data)
-        if durable:
-            handle.flush()
-            os.fsync(handle.fileno())
+    with whole_file(path, durable=durable) as scratch:
+        scratch.write_bytes(data)
 
 
 def write_text(path: Path, text: str, *, durable: bool = False) -> None:

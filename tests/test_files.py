@@ -56,6 +56,25 @@ def test_a_folder_is_replaced_only_where_all_in_it_is_ours(tmp_path: Path) -> No
         require()
 
 
+def test_what_killed_runs_left_long_ago_is_cleared_away(tmp_path: Path) -> None:
+    deep = tmp_path / "deep"
+    deep.mkdir()
+    old, young, foreign, below = (
+        tmp_path / f"{files.SCRATCH}aa.tif",
+        tmp_path / f"{files.SCRATCH}bb.tif.ovr.tmp",
+        tmp_path / ".other-part-cc.tif",
+        deep / f"{files.SCRATCH}dd",
+    )
+    for path in (old, young, foreign, below):
+        path.touch()
+        if path != young:
+            os.utime(path, (1e9, 1e9))
+    files.clear_scratch(tmp_path)
+    assert {*tmp_path.rglob("*")} == {deep, young, foreign, below}
+    files.clear_scratch(tmp_path, deep=True)
+    assert {*tmp_path.rglob("*")} == {deep, young, foreign}
+
+
 def test_json_is_read_back_and_damage_is_none(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     files.write_json(path, {"가": [1, 2.5, None]}, durable=True)
