@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Any
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.export.cog import write_cog
 from brmgeo.files import write_bytes, write_json
-from brmgeo.flight.folder import read_flight
+from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.locate.masks import frame_gsd_m, frame_picture, stored_of
 from brmgeo.pictures import SUFFIXES, encode
 from brmgeo.segment.predict import Answer, Gsd, Picture, Segmenter, mask_of, read_image
@@ -77,12 +78,16 @@ class _Job:
     gsd_m: Gsd | None
 
 
+def _frame(flight: Flight, index: int) -> Picture:
+    return frame_picture(flight, index)[0]
+
+
 def _flight_pictures(folder: Path) -> list[_Job]:
     flight = read_flight(folder)
     if not flight.has_images:
         raise MissingInputError(f"{folder}: the flight has no frames, only masks")
     return [
-        _Job(frame.file, lambda i=i: frame_picture(flight, i)[0], frame_gsd_m(flight, i))
+        _Job(frame.file, functools.partial(_frame, flight, i), frame_gsd_m(flight, i))
         for i, frame in enumerate(flight.frames)
     ]
 
@@ -91,7 +96,7 @@ def _folder_pictures(folder: Path, gsd_m: float | None, levels: tuple[float, flo
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
     if not files:
         raise MissingInputError(f"{folder}: there are no images ({', '.join(SUFFIXES)}) in it")
-    return [_Job(p.name, lambda p=p: read_image(p, levels=levels), gsd_m) for p in files]
+    return [_Job(p.name, functools.partial(read_image, p, levels=levels), gsd_m) for p in files]
 
 
 def _segment_pictures(

@@ -49,10 +49,10 @@ def test_a_folder_is_replaced_only_where_all_in_it_is_ours(tmp_path: Path) -> No
     (out / "sign.txt").write_text("")
     require()
     (out / "thesis.txt").write_text("years of work")
-    with pytest.raises(SettingsError, match="thesis.txt"):
+    with pytest.raises(SettingsError, match=r"thesis\.txt"):
         require()
     out = out / "sign.txt"
-    with pytest.raises(SettingsError, match="sign.txt"):
+    with pytest.raises(SettingsError, match=r"sign\.txt"):
         require()
 
 

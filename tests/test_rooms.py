@@ -71,7 +71,7 @@ MAY_KNOW = {
     "brmgeo.ingest": VALUES,
     "brmgeo.export": VALUES,
     "brmgeo.evaluate": VALUES,
-    "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest", "brmgeo.export.cog"},
+    "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
     "brmgeo.segment": VALUES | {"brmgeo.maps"},
     "brmgeo.locate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.segment"},
     "brmgeo.workflow": FOUNDATION | {"brmgeo"},

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import MissingInputError
-from brmgeo.export.cog import box_of, read_window
 from brmgeo.flight.readings import Camera, FloatArray
 from brmgeo.geo.grid import Bounds, bounds_of, gsd_of
+from brmgeo.geo.raster import box_of, read_window
 from brmgeo.pictures import decode, encode
 from brmgeo.region import FlightSettings as RegionFlight
 from brmgeo.synth.flight import (
