@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from brmgeo.flight.readings import Attitude, Camera, Imu
-from brmgeo.flight.vio import GyroInDegreesError, coarse_delay
+from brmgeo.flight.vio import GyroInDegreesError
+from brmgeo.flight.vio.delay import coarse_delay
 
 CAMERA = Camera.from_fov(128, 96, 43.0)
 TIMES = np.arange(64) / 8.0

@@ -16,7 +16,9 @@ from brmgeo.flight.camera import world_from_camera
 from brmgeo.flight.klt import KltTracker
 from brmgeo.flight.motion import motions, yaw_of
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu
-from brmgeo.flight.vio import SIZE, VioResult, _exp, _propagate, _tie, ground_layer, run_vio
+from brmgeo.flight.vio import Vio, VioResult, VioSettings, VioStep, run_vio
+from brmgeo.flight.vio.kernels import SIZE, exp, ground_layer, propagate, tie
+from brmgeo.flight.vio.live import IDLE_S, PATIENCE_S, READ_ON_S
 from brmgeo.synth.flight import Course, FlightSettings, Ground, Imagery, Simulator, fly, imu_of
 
 CAMERA = Camera.from_fov(320, 240, 43.0)
@@ -27,7 +29,7 @@ MOUNT = Attitude(0.02, -0.15, 0.0)
 
 
 def _random_rotation(rng: np.random.Generator, size: float) -> FloatArray:
-    return np.asarray(_exp(rng.normal(0.0, size, 3)))
+    return np.asarray(exp(rng.normal(0.0, size, 3)))
 
 
 def test_tie_jacobian_is_that_of_finite_differences() -> None:
@@ -42,10 +44,10 @@ def test_tie_jacobian_is_that_of_finite_differences() -> None:
     def residual(dx: FloatArray) -> FloatArray:
         # The true state is the nominal one with its errors put in; a delay moves pose and clone alike only here.
         moved = p + dx[0:3] + vel * dx[15]
-        turned = _exp(dx[6:9] + rot @ omega * dx[15]) @ rot
-        mount = _exp(dx[16:19]) @ nadir
-        out = _tie(
-            moved, turned, pk + dx[19:22], _exp(dx[22:25]) @ rotk, mount, vel, omega, rays, seen,
+        turned = exp(dx[6:9] + rot @ omega * dx[15]) @ rot
+        mount = exp(dx[16:19]) @ nadir
+        out = tie(
+            moved, turned, pk + dx[19:22], exp(dx[22:25]) @ rotk, mount, vel, omega, rays, seen,
             np.zeros(6), np.zeros((SIZE, SIZE)), np.zeros(SIZE),
         )  # fmt: skip
         return np.asarray(out).ravel()
@@ -56,7 +58,7 @@ def test_tie_jacobian_is_that_of_finite_differences() -> None:
     )  # r = seen - predicted
     matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     r = np.asarray(
-        _tie(p, rot, pk, rotk, nadir, vel, omega, rays, seen, np.full(6, 2.5), matrix, vector)
+        tie(p, rot, pk, rotk, nadir, vel, omega, rays, seen, np.full(6, 2.5), matrix, vector)
     ).ravel()
     np.testing.assert_allclose(matrix, 2.5 * jac.T @ jac, atol=2e-5)
     np.testing.assert_allclose(vector, 2.5 * jac.T @ r, atol=2e-6)
@@ -71,8 +73,8 @@ def test_transition_is_that_of_finite_differences() -> None:
 
     def run(dx: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         p, v, rot = state
-        p1, v1, r1, phi, _, _ = _propagate(
-            p + dx[0:3], v + dx[3:6], _exp(dx[6:9]) @ rot, bias[0] + dx[9:12], bias[1] + dx[12:15],
+        p1, v1, r1, phi, _, _ = propagate(
+            p + dx[0:3], v + dx[3:6], exp(dx[6:9]) @ rot, bias[0] + dx[9:12], bias[1] + dx[12:15],
             0.1013, 0.3027, t, gyro, accel, 1e-6, 1e-4, 1e-8, 1e-8, 1e-2,
         )  # fmt: skip
         return p1, v1, r1, phi
@@ -91,10 +93,10 @@ def test_free_fall_and_rest() -> None:
     still, held = np.zeros((len(t), 3)), np.tile([0.0, 0.0, 9.80665], (len(t), 1))
     zero = np.zeros(3)
     noise = (1e-6,) * 5
-    p, v, _, _, q, _ = _propagate(zero, zero, np.eye(3), zero, zero, 0.0, 1.5, t, still, held, *noise)
+    p, v, _, _, q, _ = propagate(zero, zero, np.eye(3), zero, zero, 0.0, 1.5, t, still, held, *noise)
     np.testing.assert_allclose(np.r_[p, v], 0.0, atol=1e-9)
     assert np.linalg.eigvalsh(q).min() > -1e-12
-    p, v, *_ = _propagate(zero, zero, np.eye(3), zero, zero, 0.0, 1.5, t, still, still, *noise)
+    p, v, *_ = propagate(zero, zero, np.eye(3), zero, zero, 0.0, 1.5, t, still, still, *noise)
     np.testing.assert_allclose([p[2], v[2]], [-9.80665 * 1.5**2 / 2, -9.80665 * 1.5], rtol=1e-9)
 
 
@@ -158,9 +160,14 @@ def _estimate(
     return result, np.asarray(xy - course.xyz_m[rows, :2])
 
 
-def test_a_flight_over_a_plane_is_followed() -> None:
+@pytest.fixture(scope="module")
+def plain() -> tuple[Course, Imu, VioResult, FloatArray]:
     course, imu = _flown()
-    result, error = _estimate(course, imu)
+    return course, imu, *_estimate(course, imu)
+
+
+def test_a_flight_over_a_plane_is_followed(plain: tuple[Course, Imu, VioResult, FloatArray]) -> None:
+    course, _, result, error = plain
     assert np.hypot(*error.T).max() < 1.5  # of 170 m
     yaw = yaw_of(result.odometry.wxyz) - course.roll_pitch_yaw[course.frame_index, 2]
     assert np.abs(np.degrees(np.angle(np.exp(1j * (yaw - yaw[0]))))).max() < 1.0
@@ -260,6 +267,143 @@ def test_delay_is_found(delay_s: float, most_m: float) -> None:
     assert abs(result.delay_s - delay_s) < 0.012
     assert result.delay_sigma_s < 0.01
     assert np.hypot(*error.T).max() < most_m
+
+
+# ---------------------------------------------------------------- frame by frame
+
+
+def _frames(course: Course, count: int | None = None) -> Iterator[tuple[float, NDArray[np.uint8], float]]:
+    rows = course.frame_index[:count]
+    for row, grey in zip(rows, _draw(course, rows, _texture())):
+        yield float(course.t_s[row]), grey, float(course.xyz_m[row, 2])
+
+
+def _aboard(
+    vio: Vio, imu: Imu, frames: Iterator[tuple[float, NDArray[np.uint8], float]], chunk: int = 1
+) -> Iterator[tuple[float, list[VioStep]]]:
+    """Readings and frames in the order in which they happen; the time, and what each call finished."""
+    following = next(frames, None)
+    for i in range(0, len(imu.t_s), chunk):
+        until = float(imu.t_s[i : i + chunk][-1])
+        while following is not None and following[0] < until:
+            yield following[0], vio.frame(*following)
+            following = next(frames, None)
+        part = slice(i, i + chunk)
+        yield until, vio.imu(imu.t_s[part], imu.gyro_rad_s[part], imu.accel_m_s2[part])
+
+
+def _assert_same(steps: list[VioStep], result: VioResult) -> None:
+    assert [s.pose.t_s for s in steps] == result.odometry.t_s.tolist()
+    np.testing.assert_array_equal([s.pose.xyz_m for s in steps], result.odometry.xyz_m)
+    np.testing.assert_array_equal([s.pose.wxyz for s in steps], result.odometry.wxyz)
+    np.testing.assert_array_equal([s.velocity_m_s for s in steps], result.velocity_m_s)
+    np.testing.assert_array_equal([s.yaw_sigma_rad for s in steps], result.yaw_sigma_rad)
+    np.testing.assert_array_equal([s.tracks for s in steps], result.tracks)
+    assert result.odometry.segment is not None
+    np.testing.assert_array_equal([s.pose.segment for s in steps], result.odometry.segment)
+
+
+def test_aboard_bit_by_bit_is_the_whole_flight(plain: tuple[Course, Imu, VioResult, FloatArray]) -> None:
+    course, imu, result, _ = plain
+    vio = Vio(CAMERA, MOUNT)
+    steps: list[VioStep] = []
+    first_at = None
+    for at, done in _aboard(vio, imu, _frames(course), chunk=7):
+        steps += done
+        if done:
+            first_at = at if first_at is None else first_at
+            assert vio.pose is done[-1].pose
+            assert vio.filter is not None
+            assert len(vio.filter.imu.t_s) < 3.0 * 200
+        assert (vio.pose is None) is (not steps)
+    steps += vio.finish()
+    _assert_same(steps, result)
+    assert vio.filter is not None
+    assert vio.filter.delay == result.delay_s
+    # The first pose comes once the beginning has been seen, and read on from.
+    begin = float(course.frame_times_s[0])
+    assert first_at is not None
+    assert begin + 19.8 + READ_ON_S <= first_at <= begin + 20.1 + READ_ON_S
+    walk = np.array([s.pose.walk_m2 for s in steps])
+    assert (np.diff(walk) >= 0.0).all()
+    # Told before the next keyframe is there: what a step is worth lags by part of one.
+    assert np.abs(walk - result.walk_m2).max() < 0.1 * result.walk_m2[-1]
+
+
+def test_clocks_apart_and_a_cold_start_aboard_are_the_whole_flight() -> None:
+    course, imu = _flown()
+    late = Imu(imu.t_s + 0.4, imu.gyro_rad_s, imu.accel_m_s2)
+    for settings, given in ((VioSettings(warm_s=7.0), late), (VioSettings(warm_s=0.0), imu)):
+        times, pictures, agl = (list(column) for column in zip(*_frames(course, 50)))
+        result = run_vio(np.array(times), pictures, np.array(agl), given, CAMERA, MOUNT, settings)
+        vio = Vio(CAMERA, MOUNT, settings)
+        told = list(_aboard(vio, given, _frames(course, 50)))
+        _assert_same([step for _, done in told for step in done] + vio.finish(), result)
+        if settings.warm_s > 0.0:
+            assert result.delay_s == pytest.approx(0.4, abs=0.05)
+        else:
+            first_at = next(at for at, done in told if done)
+            assert first_at == pytest.approx(times[0] + 0.5, abs=0.02)
+
+
+def test_the_pose_is_followed_through_the_readings_to_a_frame_that_is_not_finished() -> None:
+    course, imu = _flown()
+    vio = Vio(CAMERA, MOUNT, VioSettings(warm_s=0.0))
+    assert vio.pose_at(0.0) is None
+    for _ in _aboard(vio, imu, _frames(course, 30)):
+        pass
+    newest = vio.pose
+    assert newest is not None
+    assert vio.pose_at(newest.t_s) is newest
+    assert vio.pose_at(newest.t_s - 0.1) is None
+    assert vio.pose_at(newest.t_s + PATIENCE_S + 0.1) is None
+    ahead = vio.pose_at(newest.t_s + 0.2)
+    assert ahead is not None
+    (step,) = (s for s in vio.frame(*list(_frames(course, 31))[-1]))
+    assert ahead.t_s == pytest.approx(step.pose.t_s)
+    assert ahead.xyz_m == pytest.approx(step.pose.xyz_m, abs=0.3)
+    assert yaw_of(ahead.wxyz) == pytest.approx(yaw_of(step.pose.wxyz), abs=0.01)
+
+
+def test_readings_do_not_pile_up_while_no_frame_comes_and_frames_do_not_wait_for_ever() -> None:
+    course, _ = _flown()
+    n = 100 * 200
+    still = np.arange(n) / 200.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.80665], (n, 1))
+    vio = Vio(CAMERA, MOUNT, VioSettings(warm_s=0.0))
+    for i in range(0, n, 50):
+        vio.imu(*(a[i : i + 50] for a in still))
+    assert sum(len(t) for t, _, _ in vio._readings) <= (IDLE_S + 1.0) * 200
+    begin = 100.0 - course.frame_times_s[0]
+    frames = [(t + begin, grey, agl) for t, grey, agl in _frames(course, 40)]
+    # No reading comes any more: frames wait for a while, and then the last one is held.
+    done = [len(vio.frame(*frame)) for frame in frames]
+    assert sum(done[: round(PATIENCE_S / 0.2)]) == 0
+    assert sum(done) >= 20
+    assert len(vio._waiting) <= PATIENCE_S / 0.2 + 1
+    assert vio.finish()
+    # A pause without frames.
+    for i in range(0, n, 50):
+        vio.imu(still[0][i : i + 50] + 200.0, still[1][i : i + 50], still[2][i : i + 50])
+    assert vio.filter is not None
+    assert len(vio.filter.imu.t_s) + sum(len(t) for t, _, _ in vio._readings) <= (IDLE_S + 3.0) * 200
+    assert vio.filter.t >= 300.0 - IDLE_S - 2.0
+
+
+def test_what_cannot_be_is_refused_as_it_comes() -> None:
+    vio = Vio(CAMERA, MOUNT, VioSettings(warm_s=0.0))
+    picture = np.zeros((240, 320), dtype=np.uint8)
+    with pytest.raises(ValueError, match="a picture of"):
+        vio.frame(0.0, picture[:200], 100.0)
+    vio.frame(1.0, picture, 100.0)
+    with pytest.raises(ValueError, match="order of time"):
+        vio.frame(1.0, picture, 100.0)
+    with pytest.raises(ValueError, match="no IMU readings"):
+        vio.frame(1.0 + PATIENCE_S + 1.0, picture, 100.0)
+    with pytest.raises(ValueError, match="turning rates"):
+        vio.imu(1.0, np.zeros(2), np.zeros(3))
+    vio.imu([1.0, 1.1], np.zeros((2, 3)), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="times fall"):
+        vio.imu(1.05, np.zeros(3), np.zeros(3))
 
 
 def test_too_little_is_refused() -> None:
