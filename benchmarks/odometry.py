@@ -31,7 +31,7 @@ import numpy as np
 
 from brmgeo.flight.camera import ray_from_pixel
 from brmgeo.flight.motion import MIN_STEP_NOISE_M
-from brmgeo.flight.readings import Attitude, Camera, Imu
+from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.flight.vio import VioResult, VioSettings, run_vio
 from brmgeo.synth.flight import Course, FlightSettings, Imagery, Simulator, fly, imu_of, rectangle
 
@@ -223,8 +223,8 @@ def fly_once(condition: Condition, seed: int, imagery: Imagery, ground: Any) -> 
         )
     else:
         images = draw_flat(course, settings, imagery, condition, seed)
-    gyro, accel = imu_of(course, seed)
-    imu = Imu(course.t_s + condition.delay_s, gyro, accel)
+    imu = imu_of(course, seed)
+    imu = replace(imu, t_s=imu.t_s + condition.delay_s)
     rng = np.random.default_rng([seed, 6])
     truth = course.xyz_m[course.frame_index]
     times = course.frame_times_s

@@ -33,7 +33,7 @@ from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, rend
 from brmgeo.evaluate.scores import FALSE_FIX_M, Scores, dead_reckoning, score, travelled_m
 from brmgeo.evaluate.sift import SiftFix, SiftMatcher
 from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
-from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.folder import Flight, may_be_remade, read_flight
 from brmgeo.flight.readings import Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
@@ -61,7 +61,6 @@ from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named, town_style
 
 FloatArray = NDArray[np.float64]
-SIMULATED_NOTE = "# Simulated by brmgeo"
 PATHS = ("rectangle", "lawnmower", "random")
 
 
@@ -143,12 +142,7 @@ def _middle(maps: Maps) -> tuple[float, float]:
 
 
 def _source_of(flight: Flight) -> str:
-    return _source(flight.folder)
-
-
-def _source(folder: Path) -> str:
-    text = (folder / "flight.toml").read_text(encoding="utf-8-sig", errors="replace")
-    return "simulated" if text.startswith(SIMULATED_NOTE) else "as given"
+    return "simulated" if flight.simulated else "as given"
 
 
 RESULTS = frozenset(
@@ -170,10 +164,10 @@ def _may_replace_results(out: Path) -> None:
 def _may_replace_flight(out: Path) -> None:
     """SettingsError when ``out`` holds anything but a flight that was simulated: a real one is flown but once."""
     _may_replace(out, "flight.toml", "a simulated flight", lambda p: p.name in SIMULATED)
-    if (out / "flight.toml").is_file() and _source(out) != "simulated":
+    if (out / "flight.toml").is_file() and not may_be_remade(out):
         raise SettingsError(
-            f"--out {out}: there is a flight that brmgeo did not simulate, and it would be lost; "
-            "give a new folder or an empty one"
+            f"--out {out}: there is a flight that brmgeo did not simulate (its flight.toml does not say simulated = true), "
+            "and it would be lost; give a new folder or an empty one"
         )
 
 

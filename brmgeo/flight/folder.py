@@ -36,7 +36,10 @@ MAX_MEDIAN_TILT_DEG = 60.0
 
 #: What the odometry.json of a track says that was made from the flight's own frames.
 MADE_BY = "brmgeo odometry"
+#: What the first line of a simulated flight's flight.toml said before there was a key for it.
+_OLD_NOTE = "# Simulated by brmgeo"
 
+_TOP: dict[str, type] = {"name": str, "simulated": bool}
 _KEYS: dict[str, dict[str, type]] = {
     "camera": {"width": int, "height": int, "distortion": list}
     | dict.fromkeys(("fov_deg", "fx", "fy", "cx", "cy"), float),
@@ -61,6 +64,8 @@ class Flight:
         odometry: the track, or None.
         has_masks: masks/ holds a mask of every frame.
         has_images: the frames' pictures are there (a masks-only flight has none).
+        simulated: nobody flew it: flight.toml says so, in its key or, in older folders, in its first comment. A comment
+            is no leave to replace the folder: see ``may_be_remade``.
     """
 
     folder: Path
@@ -71,6 +76,7 @@ class Flight:
     odometry: Odometry | None
     has_masks: bool
     has_images: bool
+    simulated: bool = False
     _video: Path | None = None
     _video_start_s: float = 0.0
     _reference: tuple[Path, str | None] | None = None
@@ -277,10 +283,24 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
         odometry,
         has_masks,
         has_images,
-        video,
-        toml.number("frames", "start_s", 0.0),
-        reference,
+        simulated=bool(toml.data.get("simulated", "\n".join(toml.lines).startswith(_OLD_NOTE))),
+        _video=video,
+        _video_start_s=toml.number("frames", "start_s", 0.0),
+        _reference=reference,
     )
+
+
+def may_be_remade(folder: Path) -> bool:
+    """True where flight.toml has ``simulated = true``: brmgeo made the flight, and nothing is lost with it.
+
+    A flight that only a comment calls simulated may be a real one, written over a copied file.
+    """
+    try:
+        return (
+            tomllib.loads((folder / "flight.toml").read_text(encoding="utf-8-sig")).get("simulated") is True
+        )
+    except (OSError, ValueError):
+        return False
 
 
 # ---------------------------------------------------------------- flight.toml
@@ -303,10 +323,10 @@ class _Toml:
             line, column = (int(at[1]), int(at[2])) if at else (len(self.lines), None)
             raise refuse(path, line, column, f"not TOML: {str(error).split(' (at')[0]}") from None
         for key, value in self.data.items():
-            if key == "name":
-                self._typed("", key, value, str)
+            if key in _TOP:
+                self._typed("", key, value, _TOP[key])
             elif key not in _KEYS:
-                raise self.refuse("", key, f"unknown key {key!r}: {nearest(key, ['name', *_KEYS])}")
+                raise self.refuse("", key, f"unknown key {key!r}: {nearest(key, [*_TOP, *_KEYS])}")
             elif not isinstance(value, dict):
                 raise self.refuse("", key, f"{key!r} must be a section: [{key}]")
             else:
@@ -324,7 +344,13 @@ class _Toml:
         if kind in (int, float) and (isinstance(value, bool) or (good and not math.isfinite(value))):
             good = False
         if not good:
-            words = {int: "a whole number", float: "a finite number", str: "a text in quotes", list: "a list"}
+            words = {
+                int: "a whole number",
+                float: "a finite number",
+                str: "a text in quotes",
+                list: "a list",
+                bool: "true or false",
+            }
             raise self.refuse(section, key, f"{key!r} is {value!r}: it must be {words[kind]}")
 
     def where(self, section: str, key: str) -> tuple[int, int]:

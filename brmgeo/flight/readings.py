@@ -128,6 +128,14 @@ class Imu:
 
 
 @dataclass(frozen=True, slots=True)
+class Altimeter:
+    """Heights above ground: (n,) seconds, (n,) metres."""
+
+    t_s: FloatArray
+    agl_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Reference:
     """Where the aircraft really was, in the map's CRS: (n,) seconds, (n, 2) metres, (n,) metres or None.
 

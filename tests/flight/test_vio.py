@@ -145,7 +145,7 @@ def _flown(seed: int = 2, **changes: object) -> tuple[Course, Imu]:
         **changes,  # type: ignore[arg-type]
     )
     course = fly(np.array([[-60.0, -40.0], [40.0, -40.0], [40.0, 40.0]]), settings, seed)
-    return course, Imu(course.t_s, *imu_of(course, seed))
+    return course, imu_of(course, seed)
 
 
 def _estimate(

@@ -20,8 +20,11 @@ from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, bytes_of,
 
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
+<<<<<<< HEAD
 from brmgeo.locate.live import locate, motions_of, view_at
 from brmgeo.locate.maps import match_settings, read_maps
+=======
+>>>>>>> 7a565fa (One writer of flight folders beside the one reader: what was written is read back, and flight.toml says whether a flight is simulated)
 from brmgeo.match import METHODS, GroundMap, make_matcher
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
@@ -399,8 +402,15 @@ def test_folders_with_other_files_are_never_replaced(
     (mine / "notes" / "a.txt").write_text("b")
     kept(localize, mine, "(notes)")
     # A flight that was really flown has all the names of a simulated one.
-    edit(flight / "flight.toml", job.SIMULATED_NOTE, "# Flown on a fine day")
+    edit(flight / "flight.toml", "simulated = true", "# Flown on a fine day")
     kept(simulate, flight, "did not simulate")
+    # A comment is no leave: the file may be a copy of a simulated flight's, filled in by hand.
+    edit(flight / "flight.toml", "name =", "# Simulated by brmgeo: no real flight\nname =")
+    kept(simulate, flight, "did not simulate")
+    assert read_flight(flight).simulated
+    edit(flight / "flight.toml", "name =", "simulated = false\nname =")
+    kept(simulate, flight, "did not simulate")
+    assert not read_flight(flight).simulated
     assert {p.name for p in tmp_path.iterdir()} == {"mine", "flight"}
 
 

@@ -323,7 +323,8 @@ def test_an_odometry_reset_shows_as_a_step_unknown() -> None:
 
 def test_imu_readings_integrate_to_the_course() -> None:
     course = fly(PATH, FlightSettings(), 3)
-    gyro, accel = imu_of(course, 3)
+    imu = imu_of(course, 3)
+    gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
     n = 10 * RATE_HZ
     turned = gyro[:n, 2].sum() / RATE_HZ
     assert turned == pytest.approx(course.roll_pitch_yaw[n, 2] - course.roll_pitch_yaw[0, 2], abs=0.05)

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from brmgeo.codes import GRAVITY_M_S2
-from brmgeo.flight.readings import FloatArray, Odometry
+from brmgeo.flight.readings import Altimeter, Imu, Odometry
 from brmgeo.synth.flight.course import ODOMETRY, RATE_HZ, SENSORS, Course
-from brmgeo.synth.flight.settings import OdometryErrors
+from brmgeo.synth.flight.settings import FlightSettings, OdometryErrors
 
 
 def odometry_of(course: Course, errors: OdometryErrors, seed: int) -> Odometry:
@@ -52,8 +52,8 @@ def odometry_of(course: Course, errors: OdometryErrors, seed: int) -> Odometry:
     return Odometry(np.round(t, 6)[keep], np.round(track, 4)[keep], wxyz[keep], "odometry.tum")
 
 
-def imu_of(course: Course, seed: int) -> tuple[FloatArray, FloatArray]:
-    """(m, 3) rad/s and (m, 3) m/s2 of a consumer-grade unit in the body frame along a course, at its own rate.
+def imu_of(course: Course, seed: int) -> Imu:
+    """What a consumer-grade unit in the body says along a course, at the course's own rate.
 
     Noise densities 0.005 deg/s and 0.002 m/s2 per root Hz, constant biases of 0.1 deg/s and 0.02 m/s2.
     """
@@ -69,4 +69,13 @@ def imu_of(course: Course, seed: int) -> tuple[FloatArray, FloatArray]:
     root = math.sqrt(RATE_HZ)
     gyro += math.radians(0.1) * rng.normal(size=3) + math.radians(0.005) * root * rng.normal(size=gyro.shape)
     accel += 0.02 * rng.normal(size=3) + 0.002 * root * rng.normal(size=accel.shape)
-    return gyro, accel
+    return Imu(course.t_s, gyro, accel)
+
+
+def altimeter_of(course: Course, settings: FlightSettings, seed: int) -> Altimeter:
+    """Heights above ground along a course, ten a second, with the errors of the settings."""
+    rng = np.random.default_rng([seed, SENSORS, 2])
+    tenth = slice(None, None, RATE_HZ // 10)
+    agl = course.xyz_m[tenth, 2]
+    agl = agl + settings.agl_error_m * (rng.normal() + rng.normal(size=len(agl)))
+    return Altimeter(course.t_s[tenth], agl)
