@@ -7,28 +7,24 @@ becomes a silently ignored setting.
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from brmgeo.errors import MissingInputError, SettingsError
+from brmgeo.codes import BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, disc_radii
+from brmgeo.errors import MissingInputError
+from brmgeo.settings import build, nearest, read_toml
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 
-# B0014111-B0014118 are buildings. B0014110 is "unclassified": allowed, not default. B0014119 bounds a group of houses.
-BUILDING_LAYERS = tuple(f"B001411{k}" for k in range(1, 9))
-GROUP_BOUNDARY_LAYER = "B0014119"
-
 
 class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class FootprintsSettings(_Settings):
@@ -43,11 +39,6 @@ class FootprintsSettings(_Settings):
     layer: str | None = None
     attribution: str = ""
     repairs_layer: bool = False
-
-    @field_validator("paths", "layers", mode="before")
-    @classmethod
-    def _tuple(cls, value: Any) -> Any:
-        return tuple(value) if isinstance(value, list) else value
 
     @field_validator("layers")
     @classmethod
@@ -89,11 +80,6 @@ class ImagerySettings(_Settings):
     terms: str = ""
     compression: Literal["jpeg", "zstd"] = "jpeg"
 
-    @field_validator("bands", "value_range", mode="before")
-    @classmethod
-    def _tuple(cls, value: Any) -> Any:
-        return tuple(value) if isinstance(value, list) else value
-
     @model_validator(mode="after")
     def _complete(self) -> ImagerySettings:
         if self.kind in ("tiles", "service") and self.level is None:
@@ -115,13 +101,6 @@ class RatioSettings(_Settings):
     n: Annotated[int, Field(ge=1, le=16)] | None = None
     agl_m: Positive | None = None
     fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
-
-    @field_validator("radii_m", mode="before")
-    @classmethod
-    def _tuple(cls, value: Any) -> Any:
-        return (
-            tuple(float(v) if isinstance(v, int) else v for v in value) if isinstance(value, list) else value
-        )
 
     @model_validator(mode="after")
     def _one_way(self) -> RatioSettings:
@@ -145,7 +124,7 @@ class RatioSettings(_Settings):
         assert self.agl_m is not None
         assert self.fov_deg is not None
         ground = self.agl_m * math.tan(math.radians(self.fov_deg) / 2)
-        return tuple(ground * (self.n + 1 - k) / self.n for k in range(1, self.n + 1))
+        return disc_radii(ground, self.n)
 
 
 class FlightSettings(_Settings):
@@ -185,11 +164,6 @@ class TrainingSettings(_Settings):
     max_cloud_share: Share = 0.5
     image_format: Literal["jpg", "png"] = "jpg"
     shard_tiles: Annotated[int, Field(ge=1, le=100_000)] = 256
-
-    @field_validator("gsd_m", mode="before")
-    @classmethod
-    def _tuple(cls, value: Any) -> Any:
-        return tuple(value) if isinstance(value, list) else value
 
     @model_validator(mode="after")
     def _sound(self) -> TrainingSettings:
@@ -241,18 +215,6 @@ class Region(_Settings):
     training: TrainingSettings = TrainingSettings()
     generate: GenerateSettings | None = None
 
-    @field_validator("bounds", mode="before")
-    @classmethod
-    def _floats(cls, value: Any) -> Any:
-        return (
-            tuple(float(v) if isinstance(v, int) else v for v in value) if isinstance(value, list) else value
-        )
-
-    @field_validator("sheets", mode="before")
-    @classmethod
-    def _tuple(cls, value: Any) -> Any:
-        return tuple(value) if isinstance(value, list) else value
-
     @field_validator("sheets")
     @classmethod
     def _numbers(cls, value: tuple[str, ...]) -> tuple[str, ...]:
@@ -276,7 +238,7 @@ class Region(_Settings):
             raise ValueError("give 'bounds' or 'sheets': the region has no place")
         if self.bounds is not None:
             left, bottom, right, top = self.bounds
-            if not (all(map(math.isfinite, self.bounds)) and left < right and bottom < top):
+            if not (left < right and bottom < top):
                 raise ValueError(
                     "'bounds' must be [left, bottom, right, top] with left < right and bottom < top"
                 )
@@ -290,78 +252,15 @@ def load_region(path: Path) -> Region:
     valid key) for everything else.
     """
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        toml = read_toml(path)
+    except MissingInputError:
         known = sorted(p.stem for p in path.parent.glob("*.toml") if not p.stem.startswith("_"))
-        near = difflib.get_close_matches(path.stem, known, 1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known) or 'none'};"
         raise MissingInputError(
-            f"{path}: there is no region {path.stem!r}; {hint} `brmgeo new-region {path.stem} --sheets ...` writes one"
+            f"{path}: there is no region {path.stem!r}: {nearest(path.stem, known)}; a region is one file in this folder"
         ) from None
-    except UnicodeDecodeError:
-        raise SettingsError(f"{path}: is not UTF-8 text, as TOML must be: save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f"{path}: not valid TOML: {error}") from None
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        # TOML writes 2 for 2.0; whole numbers are welcome wherever a length or an angle is asked for.
-        region = Region.model_validate(_floats_where_asked(raw, Region))
-    except ValidationError as error:
-        raise SettingsError(f"{path}: {describe_fault(error, Region)}") from None
+    region = build(toml, Region)
     if region.name != path.stem:
-        raise SettingsError(
-            f"{path}: name: {region.name!r} differs from the file's name {path.stem!r}; make them equal"
+        raise toml.refuse(
+            f"{region.name!r} differs from the file's name {path.stem!r}; make them equal", "name"
         )
     return region
-
-
-def _floats_where_asked(raw: Any, model: type[BaseModel]) -> Any:
-    if not isinstance(raw, dict):
-        return raw
-    out = {}
-    for key, value in raw.items():
-        field = model.model_fields.get(key)
-        note = field.annotation if field else None
-        sub = _model_in(note)
-        if sub is not None and isinstance(value, dict):
-            value = _floats_where_asked(value, sub)
-        elif isinstance(value, int) and not isinstance(value, bool) and "float" in str(note):
-            value = float(value)
-        elif isinstance(value, list) and "float" in str(note):
-            value = [float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in value]
-        out[key] = value
-    return out
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    for kind in (annotation, *getattr(annotation, "__args__", ())):
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            return kind
-    return None
-
-
-def describe_fault(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first faults of a pydantic error in one line, each with its key and, for a misspelt one, the nearest key."""
-    parts = []
-    for fault in error.errors()[:3]:
-        where = [str(p) for p in fault["loc"]]
-        keys: list[str] = []
-        owner: type[BaseModel] | None = model
-        for step in where[:-1]:
-            field = owner.model_fields.get(step) if owner else None
-            owner = _model_in(field.annotation) if field else None
-        if owner:
-            keys = sorted(owner.model_fields)
-        key = ".".join(where)
-        if fault["type"] == "extra_forbidden":
-            near = difflib.get_close_matches(where[-1], keys, 1, cutoff=0.4)
-            hint = f"nearest valid key is {near[0]!r}" if near else f"valid keys are {', '.join(keys)}"
-            parts.append(f"{key}: unknown key; {hint}")
-        elif fault["type"] == "missing":
-            parts.append(f"{key}: missing key; it is required")
-        else:
-            message = fault["msg"].removeprefix("Value error, ")
-            found = "" if isinstance(fault["input"], dict | BaseModel) else f" (found {fault['input']!r})"
-            parts.append(f"{key + ': ' if key else ''}{message}{found}")
-    return "; ".join(parts)

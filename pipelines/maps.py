@@ -23,14 +23,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from pydantic import ValidationError
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError, WorkflowError
 from brmgeo.geo.crs import require_projected_metres
 from brmgeo.geo.grid import Bounds, Window, blocks, bounds_of, gsd_of, lattice
 from brmgeo.geo.sheets import check_extent, is_sheet_number, sheet_extent, sheet_number_in, sheet_polygon
 from brmgeo.geo.tilegrid import grid_named
-from brmgeo.region import ImagerySettings, Region, describe_fault
+from brmgeo.region import ImagerySettings, Region
+from brmgeo.settings import checked
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
@@ -954,10 +954,7 @@ def region_of_files(
     placeless = bounds is None and not numbers
     if placeless:
         asked["bounds"] = (0.0, 0.0, 1.0, 1.0)
-    try:
-        region = Region.model_validate(asked)
-    except ValidationError as error:
-        raise SettingsError(f"maps --footprints: {describe_fault(error, Region)}") from None
+    region = checked(Region, asked, "maps --footprints")
     return region.model_copy(update={"bounds": None}) if placeless else region
 
 

@@ -1,16 +1,5 @@
 """`brmgeo train`: from a recipe and its sources to a trained network with its curves, pictures and scores.
 
-A recipe is a TOML file (data/recipes): the U-Net, the training run, the augmentation, and the sources. A source is ground
-of one of these kinds:
-
-- ``generated``: towns that brmgeo invents, by seed, painted once and kept in data/work/scenes;
-- ``tiles``: training tiles of regions by name, as ``brmgeo tiles`` cuts them (cut now where they are not as wanted), or,
-  without ``regions``, those in a folder, such as ``brmgeo tiles --pairs`` makes;
-- ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
-- ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
-- ``flight``: a flight folder whose frames have masks; for tests only. Where ``roof_m`` says how high roofs stand, the
-  network's answers are scored once more after they were laid onto the ground as ``localize`` lays them.
-
 Folders that are not part of the project are given with ``--source NAME=PATH``.
 """
 
@@ -25,16 +14,14 @@ import os
 import re
 import shutil
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeGuard, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.flight.camera import world_from_camera
@@ -43,9 +30,10 @@ from brmgeo.flight.view import lowered
 from brmgeo.geo.grid import lattice
 from brmgeo.locate.masks import frame_gsd_m
 from brmgeo.maps.rasterize import building_mask
-from brmgeo.region import describe_fault, load_region
+from brmgeo.region import load_region
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, shrunk
 from brmgeo.segment.metrics import LogitHistogram, Scores, best_threshold, segmentation_scores
+from brmgeo.segment.recipe import Recipe, SourceSpec, read_recipe
 from brmgeo.segment.samples import Mixture, Mosaic, Scene, Scenes, Tiles
 from brmgeo.segment.shards import TileSet, check_label, read_tiles
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
@@ -63,112 +51,6 @@ _SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif")
 _FRAME_PX = 512
 _FRAMES_MOST = 150
-
-
-# --- recipes -----------------------------------------------------------------------------------------------------
-
-
-class _Spec(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SourceSpec(_Spec):
-    """One source of a recipe; see the head of this file for the kinds.
-
-    ``split`` says what the whole source is for; of ``xyz`` ``validation_share`` of it (the west) is for validation.
-    ``tiles`` that are for training take their regions' own train and validation splits; a region is in one source
-    only. ``weight``: how often the source is drawn in training. ``roof_m``: of a flight whose masks are outlines on the
-    ground, the height of the roofs that answers are also laid down from; 0: they are scored as they are alone.
-    """
-
-    name: str
-    kind: Literal["generated", "tiles", "pairs", "xyz", "flight"]
-    split: Literal["train", "validation", "test"] = "train"
-    weight: Annotated[float, Field(gt=0)] = 1.0
-    seeds: tuple[int, ...] = ()
-    days: Annotated[int, Field(ge=0, le=2)] = 0
-    size_m: Annotated[float, Field(ge=300, le=3000)] = 700.0
-    regions: tuple[str, ...] = ()
-    gsd_m: Annotated[float, Field(gt=0, le=1)] | None = None
-    zoom: Annotated[int, Field(ge=10, le=24)] = 21
-    validation_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    roof_m: Annotated[float, Field(ge=0, le=50)] = 0.0
-    attribution: str = ""
-    licence: str = ""
-
-
-class Recipe(_Spec):
-    """A training run as a file: what is trained, on what, and how.
-
-    Pictures of a GSD that was not trained for are resampled to ``work_gsd_m``.
-    """
-
-    title: str
-    work_gsd_m: Annotated[float, Field(gt=0, le=2)]
-    validation_crops: Annotated[int, Field(ge=1, le=500)] = 24
-    unet: dict[str, Any] = {}
-    training: dict[str, Any] = {}
-    augment: dict[str, Any] = {}
-    source: tuple[SourceSpec, ...]
-
-
-def read_recipe(path: Path) -> Recipe:
-    """The recipe in a file, and in those it is based on.
-
-    ``base = "NAME"`` takes NAME.toml beside the file as it is, but for what the file says itself: tables are merged key by
-    key, sources by name, new ones come last. Raises MissingInputError, or SettingsError in one line, naming file, key and
-    fault.
-    """
-    try:
-        return Recipe.model_validate(_read_with_base(path, ()))
-    except ValidationError as error:
-        raise SettingsError(f"{path}: {describe_fault(error, Recipe)}") from None
-
-
-def _read_with_base(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
-    try:
-        own = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        known = ", ".join(sorted(p.stem for p in path.parent.glob("*.toml"))) or "none"
-        asked = f" (the base of {above[-1].name})" if above else ""
-        raise MissingInputError(f"{path}: there is no such recipe{asked}; there are: {known}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not valid TOML: {error}") from None
-    base = own.pop("base", None)
-    if base is None:
-        return own
-    if not isinstance(base, str) or not re.fullmatch(r"\w[\w.-]*", base):
-        raise SettingsError(
-            f"{path}: base is {base!r}: give the name of a recipe in the same folder, without .toml"
-        )
-    below = path.with_name(f"{base}.toml")
-    if below in (*above, path):
-        raise SettingsError(f"{path}: base {base!r} leads back to this recipe: take one of the two out")
-    return _merged(_read_with_base(below, (*above, path)), own)
-
-
-def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``own`` over it: tables key by key, lists of tables by their names, anything else replaced."""
-    merged = dict(base)
-    for key, value in own.items():
-        before = base.get(key)
-        if isinstance(before, dict) and isinstance(value, dict):
-            merged[key] = _merged(before, value)
-        elif _are_named(before) and _are_named(value):
-            tables = {table["name"]: table for table in before}
-            for table in value:
-                tables[table["name"]] = _merged(tables.get(table["name"], {}), table)
-            merged[key] = list(tables.values())
-        else:
-            merged[key] = value
-    return merged
-
-
-def _are_named(tables: Any) -> TypeGuard[list[dict[str, Any]]]:
-    if not (isinstance(tables, list) and all(isinstance(table, dict) for table in tables)):
-        return False
-    names = [table.get("name") for table in tables]
-    return all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
 
 
 # --- sources -----------------------------------------------------------------------------------------------------
@@ -678,35 +560,6 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
-    """A settings dataclass from a recipe's table."""
-    known = {f.name for f in fields(kind)}  # type: ignore[arg-type]
-    foreign = sorted(set(values) - known)
-    if foreign:
-        raise SettingsError(
-            f"recipe, [{where}]: no setting {foreign[0]!r}; there are: {', '.join(sorted(known))}"
-        )
-    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    for own in fields(kind):  # type: ignore[arg-type]
-        if own.name in plain and own.default is not MISSING and not _alike(plain[own.name], own.default):
-            raise SettingsError(
-                f"recipe, [{where}]: {own.name} = {values[own.name]!r}: give it in the form of {own.default!r}"
-            )
-    try:
-        return kind(**plain)
-    except (TypeError, ValueError) as error:
-        raise SettingsError(f"recipe, [{where}]: {error}") from None
-
-
-def _alike(value: Any, example: Any) -> bool:
-    """True where a value has the type of the example: whole numbers, numbers, yes or no, text, or lists of these."""
-    if isinstance(example, tuple):
-        return isinstance(value, tuple) and all(_alike(v, example[0]) for v in value)
-    if isinstance(example, float):
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is type(example)
-
-
 def train(
     recipe_path: Path,
     data: Path,
@@ -727,29 +580,17 @@ def train(
     """
     from brmgeo.segment import train as engine
     from brmgeo.segment.imagenet import imagenet_weights
-    from brmgeo.segment.unet import UNetSettings
     from brmgeo.segment.weights import load_weights
 
     started = time.monotonic()
     recipe = read_recipe(recipe_path)
-    unet = _settings(UNetSettings, recipe.unet, "unet")
-    settings = _settings(engine.TrainSettings, recipe.training, "training")
-    augment = _settings(AugmentSettings, recipe.augment, "augment")
+    unet, settings, augment = recipe.unet, recipe.training, recipe.augment
     if steps is not None:
         settings = replace(
             settings,
             steps=steps,
             warmup_steps=min(settings.warmup_steps, steps // 4),
             mean_from=min(settings.mean_from, steps),
-        )
-    if unet.in_channels != 3:
-        raise SettingsError(
-            f"recipe, [unet]: in_channels {unet.in_channels}: pictures have 3, red, green and blue"
-        )
-    if not augment.gsd_m[0] <= recipe.work_gsd_m <= augment.gsd_m[1]:
-        raise SettingsError(
-            f"recipe: work_gsd_m {recipe.work_gsd_m:g} lies outside the crops' [augment] gsd_m {list(augment.gsd_m)}: "
-            "pictures would be resampled to what was never trained for"
         )
     settings = replace(settings, threads=threads or settings.threads or _cores())
     # What a first run lacks is said before any ground is painted.

@@ -55,6 +55,7 @@ from brmgeo.segment.tiles import (
     spatial_splits,
     tile_windows,
 )
+from brmgeo.settings import checked
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
@@ -749,14 +750,7 @@ def cut_region(
 
 
 def _changed(settings: TrainingSettings, changes: Mapping[str, Any]) -> TrainingSettings:
-    from pydantic import ValidationError
-
-    from brmgeo.region import describe_fault
-
-    try:
-        return TrainingSettings.model_validate(settings.model_dump() | dict(changes))
-    except ValidationError as error:
-        raise SettingsError(f"tiles: {describe_fault(error, TrainingSettings)}") from None
+    return checked(TrainingSettings, settings.model_dump() | dict(changes), "tiles")
 
 
 def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None, align: bool = False) -> Path:

@@ -7,16 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from brmgeo.errors import SettingsError
-
-
-def _check(owner: Any, **ranges: tuple[float, float]) -> None:
-    for name, (low, high) in ranges.items():
-        value = getattr(owner, name)
-        if not (math.isfinite(value) and low <= value <= high):
-            kind = type(owner).__name__
-            raise SettingsError(
-                f"{kind}.{name} = {value!r} is outside [{low}, {high}]: choose a value inside"
-            )
+from brmgeo.settings import require_within
 
 
 def _check_rates(owner: Any) -> None:
@@ -56,7 +47,7 @@ class OdometrySettings:
     reset_keeps_heading: float = 0.5
 
     def __post_init__(self) -> None:
-        _check(
+        require_within(
             self,
             scale_sigma=(0, 0.5),
             scale_walk_per_sqrt_s=(0, 0.1),
@@ -109,7 +100,7 @@ class RateSettings:
     learn: bool = True
 
     def __post_init__(self) -> None:
-        _check(
+        require_within(
             self,
             hit=(0.05, 0.999),
             false_alarm=(0.0005, 0.9),
@@ -160,7 +151,7 @@ class BeliefSettings:
     candidates: int = 2000
 
     def __post_init__(self) -> None:
-        _check(
+        require_within(
             self,
             cell_m=(1, 50),
             headings=(8, 720),
@@ -207,7 +198,7 @@ class RatioSettings:
     least_fit: float = 0.9
 
     def __post_init__(self) -> None:
-        _check(
+        require_within(
             self,
             radii=(1, 32),
             radius_step=(0.001, 0.2),
@@ -245,7 +236,9 @@ class PaperSettings:
     follow_turns: bool = False
 
     def __post_init__(self) -> None:
-        _check(self, radii=(1, 16), e1=(1e-6, 16), eps_m=(0.1, 500), d_max_m=(0.1, 1000), pair_work=(0, 1e10))
+        require_within(
+            self, radii=(1, 16), e1=(1e-6, 16), eps_m=(0.1, 500), d_max_m=(0.1, 1000), pair_work=(0, 1e10)
+        )
 
 
 @dataclass(frozen=True, slots=True)

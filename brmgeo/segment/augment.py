@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import SettingsError
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
+from brmgeo.settings import require_within
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -77,15 +78,19 @@ class AugmentSettings:
             raise SettingsError(
                 f"augmentation gsd_m {self.gsd_m}: give (finest, coarsest), finest above 0 and not above coarsest"
             )
-        for name in (
-            "near_buildings", "enlarge", "roofs", "objects", "grey", "shadow", "haze", "blur", "noise", "jpeg",
-        ):  # fmt: skip
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"augmentation {name} {getattr(self, name)}: give a probability, 0 to 1")
-        if not 0 <= self.tilt <= 0.3 or not 0 <= self.colour <= 2:
-            raise SettingsError(
-                f"augmentation tilt {self.tilt}, colour {self.colour}: tilt is 0 to 0.3, colour 0 to 2"
-            )
+        likely = (
+            "near_buildings",
+            "enlarge",
+            "roofs",
+            "objects",
+            "grey",
+            "shadow",
+            "haze",
+            "blur",
+            "noise",
+            "jpeg",
+        )
+        require_within(self, tilt=(0, 0.3), colour=(0, 2), **dict.fromkeys(likely, (0, 1)))
 
     @staticmethod
     def none(gsd_m: float) -> AugmentSettings:

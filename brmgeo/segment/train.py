@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import safetensors
@@ -38,10 +38,12 @@ from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, draw_crop
 from brmgeo.segment.imagenet import imagenet_weights, start_from_imagenet
 from brmgeo.segment.tiles import BUILDING, UNKNOWN
 from brmgeo.segment.unet import UNet, UNetSettings
+from brmgeo.settings import require_within
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 FORMAT, VERSION = "brmgeo-checkpoint", 1
+Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,7 @@ class TrainSettings:
         compile: let torch.compile fuse the network's passes; a step then takes 0.7 times as long on one core, 0.9 times
             on two, after half a minute of compiling. Needs a C++ compiler.
 
-    Raises SettingsError for values that cannot be trained with.
+    Raises SettingsError for values that no run can have.
     """
 
     seed: int = 1
@@ -95,18 +97,16 @@ class TrainSettings:
     patience: int = 0
     checkpoint_steps: int = 50
     threads: int = 0
-    device: str = "auto"
+    device: Device = "auto"
     imagenet: bool = False
     compile: bool = False
 
     def __post_init__(self) -> None:
-        whole = ("steps", "batch", "accumulate", "crop_px", "epoch_steps", "checkpoint_steps")
-        for name in whole:
-            if getattr(self, name) < 1:
-                raise SettingsError(f"training {name} {getattr(self, name)}: give 1 or more")
-        for name in ("seed", "stop_after", "mean_from", "patience", "threads"):
-            if getattr(self, name) < 0:
-                raise SettingsError(f"training {name} {getattr(self, name)}: give 0 or more")
+        counts = ("steps", "batch", "accumulate", "crop_px", "epoch_steps", "checkpoint_steps")
+        require_within(self, **dict.fromkeys(counts, (1, math.inf)))
+        require_within(
+            self, **dict.fromkeys(("seed", "stop_after", "mean_from", "patience", "threads"), (0, math.inf))
+        )
         if not 0 < self.encoder_lr <= 1:
             raise SettingsError(
                 f"training encoder_lr {self.encoder_lr}: give a share of lr, above 0 and at most 1"
@@ -120,13 +120,8 @@ class TrainSettings:
             raise SettingsError(
                 f"training mean_from {self.mean_from}: the run ends before it; give a step within it, or 0"
             )
-        if self.compile and not shutil.which(os.environ.get("CXX", "g++")):
-            raise SettingsError(
-                "training compile = true: needs a C++ compiler, and there is no g++ here (CXX names another); install one, "
-                "or leave compile out"
-            )
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise SettingsError(f"training device {self.device!r}: give auto, cpu or cuda")
+        if self.device not in get_args(Device):
+            raise SettingsError(f"training device {self.device!r}: give {', '.join(get_args(Device))}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +210,11 @@ def require_fit(unet: UNetSettings, settings: TrainSettings) -> None:
     if unet.encoder == "plain" and (settings.imagenet or settings.encoder_lr != 1.0):
         raise SettingsError(
             'training imagenet, encoder_lr: need [unet] encoder = "efficientnet-lite0"; the plain one has no such weights'
+        )
+    if settings.compile and not shutil.which(os.environ.get("CXX", "g++")):
+        raise SettingsError(
+            "training compile = true: needs a C++ compiler, and there is no g++ here (CXX names another); install one, "
+            "or leave compile out"
         )
 
 

@@ -224,7 +224,7 @@ def test_gsds_equal_to_the_millimetre_are_refused(
     )
     region = tiled.copied_to(tmp_path / "data", store=False)
     region.edit("gsd_m = [0.8, 1.7]", "gsd_m = [0.8001, 1.7, 0.8004]")
-    assert "small.toml: training: two of 'gsd_m'" in cut(capsys, region).error
+    assert "small.toml:24: training: two of 'gsd_m'" in cut(capsys, region).error
 
 
 @pytest.mark.slow
