@@ -11,7 +11,6 @@ from brmgeo.errors import MissingExtraError
 EXTRAS = {
     "maps": frozenset(
         (
-            "affine",
             "bokeh",
             "dask",
             "distributed",
