@@ -8,7 +8,7 @@ from pathlib import Path
 import pyogrio
 
 from brmgeo.errors import MissingInputError, SettingsError
-from brmgeo.export import replacing
+from brmgeo.files import whole_file
 from brmgeo.geo.crs import LONLAT, parse_crs
 
 WHAT = ("online", "smoothed", "reference", "candidates")
@@ -53,7 +53,7 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
     digits = 8 if frame.crs.is_geographic else 4
     for name, values in zip(names, (frame.geometry.x, frame.geometry.y), strict=True):
         frame[name] = values.round(digits)
-    with replacing(out) as scratch:
+    with whole_file(out) as scratch:
         if driver == "CSV":
             columns = [*names, *(c for c in frame.columns if c not in (*names, "geometry"))]
             frame[columns].to_csv(scratch, index=False, lineterminator="\n")

@@ -6,31 +6,12 @@ same values give the same bytes: no clock, host or path goes into them.
 
 from __future__ import annotations
 
-import os
-import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A scratch path beside ``path`` (same suffix) that takes its place when the block ends without an error.
-
-    The scratch file is removed after an error, so ``path`` holds the whole new file, or what it held before.
-    """
-    scratch = path.with_name(f".{uuid.uuid4().hex[:12]}{path.suffix}")
-    try:
-        yield scratch
-        os.replace(scratch, path)
-    finally:
-        scratch.unlink(missing_ok=True)
 
 
 def utc_ms(start_utc: datetime | None, t_s: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -11,9 +11,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from brmgeo.export import iso_utc, replacing, shown_until_ms, utc_ms
+from brmgeo.export import iso_utc, shown_until_ms, utc_ms
 from brmgeo.export.qgis_style import add_default_styles, candidates_style, qml
 from brmgeo.export.vector import epsg_of, lonlat, number, write_geojson, write_layer
+from brmgeo.files import whole_file, write_text
 from brmgeo.flight.values import Status
 
 GEOJSON_LIMIT = 100_000
@@ -63,8 +64,7 @@ def write_candidates(
     geojson, sidecar, gpkg = (out_dir / f"candidates.{suffix}" for suffix in ("geojson", "qml", "gpkg"))
     if count <= geojson_limit:
         write_geojson(geojson, "candidates", _features(all_frames, starts, ends, crs))
-        with replacing(sidecar) as scratch:
-            scratch.write_text(qml(candidates_style(), "Point"), encoding="utf-8")
+        write_text(sidecar, qml(candidates_style(), "Point"))
         gpkg.unlink(missing_ok=True)
         return geojson
 
@@ -81,7 +81,7 @@ def write_candidates(
         "mass": np.concatenate([frame.mass for frame in all_frames]).astype(np.float64),
         "status": np.repeat(np.array([frame.status for frame in all_frames], dtype=object), lengths),
     }
-    with replacing(gpkg) as scratch:
+    with whole_file(gpkg) as scratch:
         write_layer(scratch, "candidates", shapely.points(xy), "Point", crs, columns)
         add_default_styles(scratch, {"candidates": (candidates_style(), "Point")})
     geojson.unlink(missing_ok=True)

@@ -25,10 +25,7 @@ import errno
 import glob
 import logging
 import math
-import os
 import shutil
-import time
-import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +40,7 @@ from odc.geo.geobox import GeoBox
 from rasterio._err import CPLE_BaseError
 from rasterio.errors import RasterioError
 
+from brmgeo import files
 from brmgeo.codes import RATIO_SCALE, RATIO_UNKNOWN, UNKNOWN
 from brmgeo.errors import WorkflowError, one_line
 from brmgeo.geo.grid import Window, blocks
@@ -56,8 +54,6 @@ BLOCK_PX = 512
 _SLICE_PX = 2048
 # rasterio takes bytes here. Small, so that GDAL writes as it goes: it must not hold a twentieth of the machine's memory.
 _CACHE_BYTES = 32 << 20
-# Scratch files that nobody has written to for so long are of no living process.
-_STALE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,93 +99,128 @@ def write_cog(
     Raises WorkflowError when the file cannot be written (no space left, no permission), naming the reason; ValueError when
     blocks break the promises above, which is a defect of the caller.
     """
-    rows, cols = (int(n) for n in box.shape)
-    count = {"mask": 1, "ratio": len(radii_m), "imagery": 3}[kind]
-    if kind == "ratio" and not radii_m:
-        raise ValueError("a ratio raster needs radii_m, one radius for each band")
-    names = list(band_descriptions) or _default_descriptions(kind, radii_m)
-    if len(names) != count:
-        raise ValueError(f"{len(names)} band descriptions for {count} bands")
-
+    layout = _Layout(
+        kind, tuple(radii_m), tuple(band_descriptions), dict(tags or {}), dict(colormap or {}), lossless
+    )
+    layout.check()
     path = Path(path)
-    hidden = f".{glob.escape(path.name)}.{12 * '[0-9a-f]'}"
-    for old in (*path.parent.glob(f"{hidden}.blocks.tif*"), *path.parent.glob(f"{hidden}.part*")):
-        with contextlib.suppress(OSError):  # another process may clear it away just now
-            if time.time() - old.stat().st_mtime > _STALE_S:
-                old.unlink()
-    stem = f".{path.name}.{uuid.uuid4().hex[:12]}"
-    scratch, part = path.with_name(f"{stem}.blocks.tif"), path.with_name(f"{stem}.part")
+    rows, cols = (int(n) for n in box.shape)
     pieces = _sliced(data, (rows, cols)) if isinstance(data, (np.ndarray, tuple)) else data
-    dtype = "uint16" if kind == "ratio" else "uint8"
-    counts = np.zeros((count, 65536 if kind == "ratio" else 256), dtype=np.int64)
-    seen = 0
     # What GDAL may hold back in its cache must always fit: running into the end of the disk, GDAL also writes to stderr.
-    reserve = min(rows * cols * count * np.dtype(dtype).itemsize, _CACHE_BYTES)
+    reserve = min(rows * cols * layout.count * np.dtype(layout.dtype).itemsize, _CACHE_BYTES)
+    files.clear_scratch(path.parent)
     try:
-        _check_writable(part)
-        _check_space(path, reserve)
-        with _gdal(path), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_CACHEMAX=_CACHE_BYTES):
-            with rasterio.open(
-                scratch,
-                "w",
-                driver="GTiff",
-                height=rows,
-                width=cols,
-                count=count,
-                dtype=dtype,
-                crs=_rasterio_crs(box),
-                transform=box.affine,
-                nodata={"mask": UNKNOWN, "ratio": RATIO_UNKNOWN, "imagery": None}[kind],
-                tiled=True,
-                blockxsize=BLOCK_PX,
-                blockysize=BLOCK_PX,
-                interleave="pixel",
-                compress="zstd",
-                zstd_level=1,
-                predictor=2,
-                bigtiff="IF_SAFER",
-                **({"photometric": "RGB"} if kind == "imagery" else {}),
-            ) as dst:
-                for window, block in pieces:
-                    values, valid = _checked(kind, block, window, (rows, cols), count)
-                    target = rasterio.windows.Window(window.col, window.row, window.width, window.height)
-                    dst.write(values, window=target)
-                    if valid is not None:
-                        dst.write_mask(valid, window=target)
-                    for band in range(count):
-                        known = values[band] if valid is None else values[band][valid]
-                        counts[band] += np.bincount(known.ravel(), minlength=counts.shape[1])
-                    _check_space(path, reserve)
-                    seen += window.height * window.width
-                if seen != rows * cols:
-                    raise ValueError(
-                        f"blocks hold {seen} pixels of {rows * cols}: they must tile the lattice once"
-                    )
-                stats = [_statistics(kind, c) for c in counts]
-                dst.update_tags(**dict(sorted((tags or {}).items())))
-                for band, name in enumerate(names, start=1):
-                    dst.set_band_description(band, name)
-                    own = {"radius_m": repr(float(radii_m[band - 1]))} if kind == "ratio" else {}
-                    approximate = kind == "imagery" and not lossless
-                    dst.update_tags(band, **own, **_statistics_tags(kind, stats[band - 1], approximate))
-                if kind == "ratio":
-                    dst.scales = (RATIO_SCALE,) * count
-                if kind == "mask" and colormap:
-                    dst.write_colormap(1, dict(colormap))
-            # The result and its overviews (a third), and these once more while they are made; JPEG is far smaller.
-            share = 0.1 if kind == "imagery" and not lossless else 1.3
-            _check_space(path, int(share * scratch.stat().st_size))
-            rasterio.shutil.copy(scratch, part, driver="COG", **_cog_options(kind, lossless))
-        _check_complete(part, path)
-        _synchronise(part)
-        os.replace(part, path)
+        with files.whole_file(path, durable=True) as part:
+            _check_writable(part)
+            try:
+                with _gdal(path), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_CACHEMAX=_CACHE_BYTES):
+                    scratch = part.with_name(f"{part.name}.blocks.tif")
+                    stats = _write_blocks(scratch, pieces, box, layout, reserve)
+                    # The result and its overviews (a third), and these once more while they are made; JPEG is far smaller.
+                    share = 0.1 if kind == "imagery" and not lossless else 1.3
+                    _check_space(part, int(share * scratch.stat().st_size))
+                    rasterio.shutil.copy(scratch, part, driver="COG", **_cog_options(kind, lossless))
+                _check_complete(part, path)
+            finally:
+                # GDAL leaves its own scratch files (overviews, masks) beside the part file when it is stopped.
+                for left in path.parent.glob(f"{glob.escape(part.name)}.*"):
+                    left.unlink(missing_ok=True)
     except OSError as error:
         raise _unwritable(path, error) from error
-    finally:
-        # GDAL leaves its own scratch files (overviews, masks) beside the part file when it is stopped.
-        for left in path.parent.glob(f"{glob.escape(stem)}*"):
-            left.unlink(missing_ok=True)
     return stats
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What a raster's file holds besides pixels; see ``write_cog``."""
+
+    kind: Kind
+    radii_m: tuple[float, ...]
+    band_descriptions: tuple[str, ...]
+    tags: dict[str, str]
+    colormap: dict[int, tuple[int, int, int, int]]
+    lossless: bool
+
+    @property
+    def count(self) -> int:
+        """Number of bands."""
+        return {"mask": 1, "ratio": len(self.radii_m), "imagery": 3}[self.kind]
+
+    @property
+    def dtype(self) -> str:
+        return "uint16" if self.kind == "ratio" else "uint8"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One description a band."""
+        return self.band_descriptions or _default_descriptions(self.kind, self.radii_m)
+
+    def check(self) -> None:
+        if self.kind == "ratio" and not self.radii_m:
+            raise ValueError("a ratio raster needs radii_m, one radius for each band")
+        if len(self.names) != self.count:
+            raise ValueError(f"{len(self.names)} band descriptions for {self.count} bands")
+
+
+def _write_blocks(
+    scratch: Path, pieces: Iterable[tuple[Window, Block]], box: GeoBox, layout: _Layout, reserve: int
+) -> list[BandStatistics]:
+    """The tiled scratch file with pixels, masks, tags and colours; ``reserve`` bytes stay free beside it."""
+    rows, cols = (int(n) for n in box.shape)
+    counts = np.zeros((layout.count, np.iinfo(layout.dtype).max + 1), dtype=np.int64)
+    seen = 0
+    _check_space(scratch, reserve)
+    with rasterio.open(
+        scratch,
+        "w",
+        driver="GTiff",
+        height=rows,
+        width=cols,
+        count=layout.count,
+        dtype=layout.dtype,
+        crs=_rasterio_crs(box),
+        transform=box.affine,
+        nodata={"mask": UNKNOWN, "ratio": RATIO_UNKNOWN, "imagery": None}[layout.kind],
+        tiled=True,
+        blockxsize=BLOCK_PX,
+        blockysize=BLOCK_PX,
+        interleave="pixel",
+        compress="zstd",
+        zstd_level=1,
+        predictor=2,
+        bigtiff="IF_SAFER",
+        **({"photometric": "RGB"} if layout.kind == "imagery" else {}),
+    ) as dst:
+        for window, block in pieces:
+            values, valid = _checked(layout.kind, block, window, (rows, cols), layout.count)
+            target = rasterio.windows.Window(window.col, window.row, window.width, window.height)
+            dst.write(values, window=target)
+            if valid is not None:
+                dst.write_mask(valid, window=target)
+            for band in range(layout.count):
+                known = values[band] if valid is None else values[band][valid]
+                counts[band] += np.bincount(known.ravel(), minlength=counts.shape[1])
+            _check_space(scratch, reserve)
+            seen += window.height * window.width
+        if seen != rows * cols:
+            raise ValueError(f"blocks hold {seen} pixels of {rows * cols}: they must tile the lattice once")
+        stats = [_statistics(layout.kind, c) for c in counts]
+        _describe(dst, layout, stats)
+    return stats
+
+
+def _describe(dst: Any, layout: _Layout, stats: Sequence[BandStatistics]) -> None:
+    """Tags, band names, scales and colours."""
+    dst.update_tags(**dict(sorted(layout.tags.items())))
+    for band, name in enumerate(layout.names, start=1):
+        dst.set_band_description(band, name)
+        own = {"radius_m": repr(float(layout.radii_m[band - 1]))} if layout.kind == "ratio" else {}
+        approximate = layout.kind == "imagery" and not layout.lossless
+        dst.update_tags(band, **own, **_statistics_tags(layout.kind, stats[band - 1], approximate))
+    if layout.kind == "ratio":
+        dst.scales = (RATIO_SCALE,) * layout.count
+    if layout.kind == "mask" and layout.colormap:
+        dst.write_colormap(1, layout.colormap)
 
 
 def encode_ratio(ratio: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
@@ -290,10 +321,10 @@ def _statistics_tags(kind: Kind, stats: BandStatistics, approximate: bool) -> di
     return {"STATISTICS_APPROXIMATE": "YES", **tags} if approximate else tags
 
 
-def _default_descriptions(kind: Kind, radii_m: Sequence[float]) -> list[str]:
+def _default_descriptions(kind: Kind, radii_m: Sequence[float]) -> tuple[str, ...]:
     if kind == "ratio":
-        return [f"building ratio within {radius:g} m" for radius in radii_m]
-    return ["building (1), other (0), unknown (255)"] if kind == "mask" else ["red", "green", "blue"]
+        return tuple(f"building ratio within {radius:g} m" for radius in radii_m)
+    return ("building (1), other (0), unknown (255)",) if kind == "mask" else ("red", "green", "blue")
 
 
 def _cog_options(kind: Kind, lossless: bool) -> dict[str, str]:
@@ -354,26 +385,23 @@ def _gdal(path: Path) -> Iterator[None]:
 
 
 def _unwritable(path: Path, error: OSError) -> WorkflowError:
-    """One line: which file, why, and what to do."""
-    reason = error.strerror or one_line(error)
-    lowered = reason.lower()
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    if full or any(words in lowered for words in ("no space", "quota", "too large")):
+    """One line: which file, why, and what to do. GDAL tells what the disk said in words of its own, without a number."""
+    found = error.strerror or one_line(error)
+    why = files.reason(error)
+    if any(words in found.lower() for words in ("no space", "quota", "too large")):
+        why = why or files.reason_of(errno.ENOSPC)
+    if why is None:
         return WorkflowError(
-            f"cannot write {path}: {reason}; free some space or choose another folder for results"
+            f"cannot write {path}: {found}; check the folder, its permissions and its free space"
         )
-    return WorkflowError(
-        f"cannot write {path}: {reason}; check the folder, its permissions and its free space"
-    )
+    return WorkflowError(f"cannot write {path}: {why} ({found})")
 
 
 def _check_space(path: Path, need: int) -> None:
     """Raises OSError (ENOSPC) where fewer than ``need`` bytes are free beside ``path``."""
     free = shutil.disk_usage(path.parent).free
     if free < need:
-        found = (
-            f"No space left on device ({free / 1e6:.1f} MB free in {path.parent}, {need / 1e6:.1f} MB wanted)"
-        )
+        found = f"{free / 1e6:.1f} MB free in {path.parent}, {need / 1e6:.1f} MB wanted"
         raise OSError(errno.ENOSPC, found)
 
 
@@ -400,12 +428,3 @@ def _check_complete(part: Path, path: Path) -> None:
     # A block of nodata only may be left out of the file; then there is nothing to check.
     if start is not None and length is not None and size < int(start) + int(length):
         raise _unwritable(path, OSError(f"the file ends at byte {size}, before its last block"))
-
-
-def _synchronise(part: Path) -> None:
-    """Bring the bytes to the disk before the name, or a power cut leaves an empty file under it."""
-    handle = os.open(part, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +12,8 @@ import numpy as np
 import pyogrio
 
 from brmgeo.errors import WorkflowError, one_line
-
-# GeoPackages carry the time of their writing; a fixed one keeps equal contents equal in bytes.
-_DATE = "2000-01-01T00:00:00Z"
+from brmgeo.export.vector import fixed_date
+from brmgeo.files import whole_file
 
 
 class RepairLike(Protocol):
@@ -54,38 +52,31 @@ def write_footprints_gpkg(
         repairs: repairs with x, y in that CRS; those without a place are left out.
     """
     path = Path(path)
-    draft = path.with_name(f".{path.stem}.{os.getpid()}.gpkg")
     layers = {"footprints": (footprints, "Polygon"), "sheets": (sheets, "Polygon")}
     if repairs is not None:
         layers["repairs"] = (_repair_frame(repairs, footprints.crs), "Point")
-    before = pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
     try:
-        draft.unlink(missing_ok=True)
-        for name, (frame, kind) in layers.items():
-            pyogrio.write_dataframe(
-                frame,
-                draft,
-                layer=name,
-                driver="GPKG",
-                geometry_type=kind,
-                append=draft.exists(),
-                SPATIAL_INDEX="YES",
-                VERSION="1.3",  # the newest that QGIS 3.22 (Debian 12) reads without a warning
-            )
-        # VACUUM leaves no freed pages behind, whose old contents would differ from run to run.
-        with sqlite3.connect(draft) as database:
-            database.execute("VACUUM")
-        database.close()
-        os.replace(draft, path)
+        with whole_file(path) as draft, fixed_date("2000-01-01T00:00:00Z"):
+            for name, (frame, kind) in layers.items():
+                pyogrio.write_dataframe(
+                    frame,
+                    draft,
+                    layer=name,
+                    driver="GPKG",
+                    geometry_type=kind,
+                    append=draft.exists(),
+                    SPATIAL_INDEX="YES",
+                    VERSION="1.3",  # the newest that QGIS 3.22 (Debian 12) reads without a warning
+                )
+            # VACUUM leaves no freed pages behind, whose old contents would differ from run to run.
+            with sqlite3.connect(draft) as database:
+                database.execute("VACUUM")
+            database.close()
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, sqlite3.Error, OSError) as error:
         reason = one_line(error, 160)
         raise WorkflowError(
             f"{path}: the footprints cannot be written ({reason}): check space and rights"
         ) from error
-    finally:
-        draft.unlink(missing_ok=True)
-        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": before})
 
 
 def _repair_frame(repairs: Sequence[RepairLike], crs: object) -> gpd.GeoDataFrame:

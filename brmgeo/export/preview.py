@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from matplotlib import colormaps, font_manager, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import FuncNorm, to_rgb
@@ -18,14 +18,22 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from scipy import ndimage
 
+from brmgeo.codes import BUILDING, UNKNOWN
 from brmgeo.errors import InputError
-from brmgeo.export import replacing
+from brmgeo.files import whole_file
 from brmgeo.geo.crs import crs_name
+from brmgeo.geo.grid import Bounds
+from brmgeo.geo.raster import opened
 
 WIDTH_PX, DPI = 1600, 100
 INK, PAPER, FAINT = "#1d2430", "#ffffff", "#5d6777"
-LEFT, RIGHT = 0.04, 0.503  # where the panels begin, as shares of the width
-GROUND, BUILDING, UNKNOWN = "#e9ebe4", "#ff5436", "#b9c0ca"
+LEFT, RIGHT, PANEL_W = (
+    0.04,
+    0.503,
+    0.44,
+)  # where the panels begin, and how wide they are, as shares of the width
+TOP_PX, BOTTOM_PX = 92, 104
+GROUND, ROOF, NOT_KNOWN = "#e9ebe4", "#ff5436", "#b9c0ca"
 # Titles and attributions may be Korean; the first font that has a sign draws it.
 FONTS = (
     "DejaVu Sans",
@@ -55,16 +63,11 @@ def write_preview(
 
     Raises InputError when a raster cannot be read.
     """
-    with _opened(buildings) as src:
-        bounds, crs, full = src.bounds, crs_name(src.crs.to_wkt()), src.shape
-    aspect = (bounds.top - bounds.bottom) / (bounds.right - bounds.left)
-    panel_w = 0.44
-    panel_px = round(WIDTH_PX * panel_w)
-    # Long strips would make a picture of any height: beyond these the panel is letterboxed.
-    panel_h_px = round(panel_px * min(max(aspect, 0.45), 1.6))
-    top_px, bottom_px = 92, 104
-    height_px = top_px + panel_h_px + bottom_px
-    scale = max(full[0] / panel_h_px, full[1] / panel_px, 1.0)
+    with opened(buildings) as src:
+        b, crs, full = src.bounds, crs_name(src.crs.to_wkt()), src.shape
+    bounds = (b.left, b.bottom, b.right, b.top)
+    page = _page(bounds)
+    scale = max(full[0] / page.panel_h_px, full[1] / page.panel_px, 1.0)
     shape = (max(round(full[0] / scale), 1), max(round(full[1] / scale), 1))
 
     # Several mask pixels to one of the picture, or houses would come and go with the sampling.
@@ -74,71 +77,90 @@ def write_preview(
     with rc_context(
         {"font.family": _fonts(), "font.size": 10, "text.color": INK, "axes.unicode_minus": False}
     ):
-        figure = Figure(figsize=(WIDTH_PX / DPI, height_px / DPI), dpi=DPI, facecolor=PAPER)
+        figure = Figure(figsize=(WIDTH_PX / DPI, page.height_px / DPI), dpi=DPI, facecolor=PAPER)
         FigureCanvasAgg(figure)
-        boxes = [(x, bottom_px / height_px, panel_w, panel_h_px / height_px) for x in (LEFT, RIGHT)]
-        extent = (bounds.left, bounds.right, bounds.bottom, bounds.top)
-        left, right = (figure.add_axes(box) for box in boxes)
+        extent = (b.left, b.right, b.bottom, b.top)
+        left, right = (figure.add_axes(page.box(x)) for x in (LEFT, RIGHT))
         left.imshow(_with_buildings(mask, finer, imagery), extent=extent, interpolation="nearest")
         # Square root: countryside lives below a tenth, and the scale still ends at 1 so that regions compare.
         norm = FuncNorm((np.sqrt, np.square), vmin=0.0, vmax=1.0)
-        colours = colormaps["viridis"].with_extremes(bad=UNKNOWN)
+        colours = colormaps["viridis"].with_extremes(bad=NOT_KNOWN)
         picture = right.imshow(shares, extent=extent, norm=norm, cmap=colours, interpolation="nearest")
         for axes in (left, right):
             _frame(axes, extent)
         right.tick_params(labelleft=False)
-        above = 1 + 12 / panel_h_px
-        what = "Imagery and buildings" if imagery is not None else "Buildings"
-        left.text(0, above, what, transform=left.transAxes, fontsize=11.5, fontweight="bold", color=INK)
+        _heading(left, "Imagery and buildings" if imagery is not None else "Buildings", page)
         within = f" within {radius:.4g} m" if radius is not None else f", band {band}"
-        right.text(
-            0,
-            above,
-            f"Share of building{within}",
-            transform=right.transAxes,
-            fontsize=11.5,
-            fontweight="bold",
-            color=INK,
-        )
+        _heading(right, f"Share of building{within}", page)
         _scale_bar(left, extent)
-        _north(left, panel_px, panel_h_px)
-        _legend(left, mask, _strength(imagery), panel_h_px)
-        bar = figure.add_axes((RIGHT + panel_w + 0.008, boxes[1][1], 0.009, boxes[1][3]))
-        colour_bar = figure.colorbar(picture, cax=bar, ticks=[0, 0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0])
-        colour_bar.ax.set_yticklabels(
-            ["0", "1 %", "5 %", "10 %", "20 %", "40 %", "60 %", "80 %", "100 %"], fontsize=8
-        )
-        colour_bar.outline.set_edgecolor("#c3c9d1")
-        bar.tick_params(length=2, color=FAINT, labelcolor=FAINT, pad=2)
-        figure.text(LEFT, 1 - 42 / height_px, title, fontsize=19, fontweight="bold", va="baseline")
-        size = f"{(bounds.right - bounds.left) / 1000:.2f} x {(bounds.top - bounds.bottom) / 1000:.2f} km"
-        figure.text(
-            0.515 + panel_w, 1 - 42 / height_px, f"{crs}, {size}", fontsize=10, color=FAINT, ha="right"
-        )
-        figure.text(LEFT, 22 / height_px, attribution, fontsize=8.5, color=FAINT)
-        with replacing(path) as scratch, warnings.catch_warnings():
+        _north(left, page)
+        _legend(left, mask, _strength(imagery), page.panel_h_px)
+        _colour_bar(figure, picture, page)
+        _captions(figure, page, title, crs, bounds, attribution)
+        with whole_file(path) as scratch, warnings.catch_warnings():
             # Without any Korean font the signs become boxes, which is no reason to have no picture.
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
             figure.savefig(scratch, dpi=DPI, metadata={"Software": None}, format="png")
     return path
 
 
-def _opened(path: Path) -> Any:
-    try:
-        return rasterio.open(path)
-    except rasterio.RasterioIOError as error:
-        raise InputError(f"{path}: cannot be read as a raster ({error}); build the maps again") from error
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """Sizes of the picture and of its two panels, pixels."""
+
+    panel_px: int
+    panel_h_px: int
+
+    @property
+    def height_px(self) -> int:
+        return TOP_PX + self.panel_h_px + BOTTOM_PX
+
+    def box(self, x: float) -> tuple[float, float, float, float]:
+        """(left, bottom, width, height) of the panel that begins at ``x``, as shares of the picture."""
+        return (x, BOTTOM_PX / self.height_px, PANEL_W, self.panel_h_px / self.height_px)
+
+
+def _page(bounds: Bounds) -> _Page:
+    aspect = (bounds[3] - bounds[1]) / (bounds[2] - bounds[0])
+    panel_px = round(WIDTH_PX * PANEL_W)
+    # Long strips would make a picture of any height: beyond these the panel is letterboxed.
+    return _Page(panel_px, round(panel_px * min(max(aspect, 0.45), 1.6)))
+
+
+def _heading(axes: Any, text: str, page: _Page) -> None:
+    above = 1 + 12 / page.panel_h_px
+    axes.text(0, above, text, transform=axes.transAxes, fontsize=11.5, fontweight="bold", color=INK)
+
+
+def _colour_bar(figure: Any, picture: Any, page: _Page) -> None:
+    _, bottom, _, height = page.box(RIGHT)
+    bar = figure.add_axes((RIGHT + PANEL_W + 0.008, bottom, 0.009, height))
+    colour_bar = figure.colorbar(picture, cax=bar, ticks=[0, 0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0])
+    colour_bar.ax.set_yticklabels(
+        ["0", "1 %", "5 %", "10 %", "20 %", "40 %", "60 %", "80 %", "100 %"], fontsize=8
+    )
+    colour_bar.outline.set_edgecolor("#c3c9d1")
+    bar.tick_params(length=2, color=FAINT, labelcolor=FAINT, pad=2)
+
+
+def _captions(figure: Any, page: _Page, title: str, crs: str, bounds: Bounds, attribution: str) -> None:
+    """Title, CRS and size above the panels, the attribution below."""
+    above = 1 - 42 / page.height_px
+    figure.text(LEFT, above, title, fontsize=19, fontweight="bold", va="baseline")
+    size = f"{(bounds[2] - bounds[0]) / 1000:.2f} x {(bounds[3] - bounds[1]) / 1000:.2f} km"
+    figure.text(0.515 + PANEL_W, above, f"{crs}, {size}", fontsize=10, color=FAINT, ha="right")
+    figure.text(LEFT, 22 / page.height_px, attribution, fontsize=8.5, color=FAINT)
 
 
 def _decimated(path: Path, bands: list[int], shape: tuple[int, int], resampling: Resampling) -> Any:
     """(bands, rows, cols) masked array of a whole raster brought to ``shape``, read through its overviews."""
-    with _opened(path) as src:
+    with opened(path) as src:
         return src.read(bands, out_shape=(len(bands), *shape), resampling=resampling, masked=True)
 
 
 def _ratio(path: Path, band: int, shape: tuple[int, int]) -> tuple[NDArray[np.float64], float | None]:
     """One band as shares in [0, 1], NaN where unknown, and its radius in metres where the band tells it."""
-    with _opened(path) as src:
+    with opened(path) as src:
         if not 1 <= band <= src.count:
             raise InputError(f"{path}: band {band} was asked for, it has {src.count}; choose one of those")
         scale, offset, radius = src.scales[band - 1], src.offsets[band - 1], src.tags(band).get("radius_m")
@@ -159,9 +181,9 @@ def _with_buildings(mask: NDArray[np.uint8], finer: int, imagery: Path | None) -
     ``mask`` has ``finer`` x ``finer`` pixels to one of the picture.
     """
     rows, cols = mask.shape[0] // finer, mask.shape[1] // finer
-    ground = np.full((rows, cols, 3), to_rgb(GROUND if imagery is None else UNKNOWN))
+    ground = np.full((rows, cols, 3), to_rgb(GROUND if imagery is None else NOT_KNOWN))
     if imagery is not None:
-        with _opened(imagery) as src:
+        with opened(imagery) as src:
             bands = [1, 2, 3] if src.count >= 3 else [1, 1, 1]
         pixels = _decimated(imagery, bands, (rows, cols), Resampling.average)
         seen = ~np.ma.getmaskarray(pixels).any(axis=0)
@@ -170,12 +192,12 @@ def _with_buildings(mask: NDArray[np.uint8], finer: int, imagery: Path | None) -
     def share(of: NDArray[np.bool_]) -> NDArray[np.float64]:
         return np.asarray(of.reshape(rows, finer, cols, finer).mean(axis=(1, 3))[..., None], dtype=np.float64)
 
-    building = mask == 1
+    building = mask == BUILDING
     inner = ndimage.binary_erosion(building, iterations=finer, border_value=1)
-    tint, grey = np.array(to_rgb(BUILDING)), np.array(to_rgb(UNKNOWN))
+    tint, grey = np.array(to_rgb(ROOF)), np.array(to_rgb(NOT_KNOWN))
     opacity = _strength(imagery) * share(inner) + 0.9 * share(building & ~inner)
     ground = (1.0 - opacity) * ground + opacity * tint
-    washed = 0.6 * share(mask == 255)
+    washed = 0.6 * share(mask == UNKNOWN)
     picture: NDArray[np.float64] = (1.0 - washed) * ground + washed * grey
     return picture
 
@@ -222,8 +244,9 @@ def _scale_bar(axes: Any, extent: tuple[float, float, float, float]) -> None:
     axes.text(x + length / 2, y + thick + 5 * unit, text, ha="center", va="bottom", fontsize=9)
 
 
-def _north(axes: Any, panel_px: int, panel_h_px: int) -> None:
-    box = axes.inset_axes((1 - 62 / panel_px, 1 - 86 / panel_h_px, 50 / panel_px, 74 / panel_h_px))
+def _north(axes: Any, page: _Page) -> None:
+    w, h = page.panel_px, page.panel_h_px
+    box = axes.inset_axes((1 - 62 / w, 1 - 86 / h, 50 / w, 74 / h))
     box.set_axis_off()
     box.set_xlim(-1, 1)
     box.set_ylim(-1, 1.6)
@@ -238,9 +261,9 @@ def _north(axes: Any, panel_px: int, panel_h_px: int) -> None:
 
 
 def _legend(axes: Any, mask: NDArray[np.uint8], strength: float, panel_h_px: int) -> None:
-    entries = [Patch(facecolor=(*to_rgb(BUILDING), strength), edgecolor=BUILDING, label="Building")]
-    if (mask == 255).any():
-        entries.append(Patch(facecolor=UNKNOWN, edgecolor=UNKNOWN, label="Unknown: no sheet here"))
+    entries = [Patch(facecolor=(*to_rgb(ROOF), strength), edgecolor=ROOF, label="Building")]
+    if (mask == UNKNOWN).any():
+        entries.append(Patch(facecolor=NOT_KNOWN, edgecolor=NOT_KNOWN, label="Unknown: no sheet here"))
     axes.legend(
         handles=entries,
         loc="upper left",

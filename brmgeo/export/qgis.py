@@ -10,23 +10,24 @@ from __future__ import annotations
 import os
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pyogrio
-import rasterio
 from numpy.typing import NDArray
 from pyproj import CRS
 from rasterio.enums import MaskFlags
 
 from brmgeo.errors import CrsError, InputError
-from brmgeo.export import iso_utc, replacing, shown_until_ms, utc_ms
+from brmgeo.export import iso_utc, shown_until_ms, utc_ms
 from brmgeo.export import qgis_style as style
 from brmgeo.export.qgis_style import Style, sub
+from brmgeo.files import whole_file
 from brmgeo.geo.grid import Bounds
+from brmgeo.geo.raster import opened
 
 KIND_FIELDS = ("kind", "layer", "종류")
 SHEET_FIELDS = ("sheet", "number", "name")
@@ -101,7 +102,17 @@ def write_maps_project(
         visible = name != "repairs"
         open_legend = name == "footprints"
         vectors.append(
-            _Layer(name, shown[name], source, crs, looks, geometry, visible, attribution, open_legend)
+            _Layer(
+                name,
+                shown[name],
+                source,
+                crs,
+                looks,
+                geometry=geometry,
+                visible=visible,
+                attribution=attribution,
+                expanded=open_legend,
+            )
         )
 
     mask = _Layer("buildings", "Building mask", f"./{buildings.name}", crs, style.mask_style(), visible=False)
@@ -166,15 +177,42 @@ def write_flight_project(
 
     found = {
         name: _vector_facts(trajectory, name)
-        for name in ("online", "online_path", "smoothed", "smoothed_path")
+        for path_name in ("online", "smoothed", "reference")
+        for name in (path_name, f"{path_name}_path")
     }
-    found |= {name: _vector_facts(trajectory, name) for name in ("reference", "reference_path")}
     for geometry, _, layer_crs in found.values():
         if geometry is not None:
             _same_crs(layer_crs, crs, trajectory)
+    now, paths = _path_layers(
+        trajectory, {name: geometry for name, (geometry, _, _) in found.items()}, crs, attribution
+    )
+    tree: list[_Layer | _Group] = [
+        _Group("Now", now),
+        *_candidate_layers(candidates, crs, attribution),
+        _Group("Paths", paths),
+    ]
+    mask = style.mask_style("#ffffff", 90) if imagery is not None else style.mask_style("#5b6472", 230)
+    tree.append(_Layer("buildings", "Building mask", f"{href}/{buildings.name}", crs, mask))
+    if imagery is not None:
+        _, _, image_bands = _raster_facts(imagery)
+        looks = style.rgb_style(len(image_bands))
+        tree.append(
+            _Layer("imagery", "Imagery", f"{href}/{imagery.name}", crs, looks, attribution=attribution)
+        )
+    extent = (
+        _path_bounds(trajectory, [name for name, facts in found.items() if facts[0] is not None]) or bounds
+    )
+    _write(path, title, crs, extent, tree, attribution, _clock(t_s, start_utc))
+    return path
+
+
+def _path_layers(
+    trajectory: Path, geometries: Mapping[str, str | None], crs: CRS, attribution: str
+) -> tuple[list[_Layer], list[_Layer]]:
+    """What moves with the clock, and the paths below it; tables without a geometry are left out."""
 
     def vector(layer_id: str, table: str, name: str, looks: Style, visible: bool = True) -> list[_Layer]:
-        geometry = found[table][0]
+        geometry = geometries[table]
         if geometry is None:
             return []
         source = f"./{trajectory.name}|layername={table}"
@@ -184,40 +222,38 @@ def write_flight_project(
     now = vector("fix_now", "online", "Fix (ring: 2 sigma)", tracks["online"][0])
     now += vector("smoothed_now", "smoothed", "Smoothed position", tracks["smoothed"][0])
     now += vector("reference_now", "reference", "Reference position", tracks["reference"][0])
-    dots: list[_Layer] = []
-    lonlat = candidates.suffix == ".geojson"
-    facts = pyogrio.read_info(candidates, layer=None if lonlat else candidates.stem, force_feature_count=True)
-    # A GeoJSON file without features has no geometry type, and QGIS drops such a layer.
-    if facts["features"]:
-        source = f"./{candidates.name}" + ("" if lonlat else f"|layername={candidates.stem}")
-        dots_crs = CRS.from_epsg(4326) if lonlat else crs
-        dots_look = style.candidates_style()
-        dots = [
-            _Layer("candidates", "Candidates", source, dots_crs, dots_look, "Point", True, attribution, True)
-        ]
     paths = vector("trail", "online", "Fixes so far", style.trail_style(style.ONLINE))
     paths += vector("reference_path", "reference_path", "Reference path", tracks["reference"][1])
     paths += vector("smoothed_path", "smoothed_path", "Smoothed path", tracks["smoothed"][1])
     paths += vector("online_path", "online_path", "Online fixes, whole flight", tracks["online"][1], False)
+    return now, paths
 
-    tree: list[_Layer | _Group] = [_Group("Now", now), *dots, _Group("Paths", paths)]
-    mask = style.mask_style("#ffffff", 90) if imagery is not None else style.mask_style("#5b6472", 230)
-    tree.append(_Layer("buildings", "Building mask", f"{href}/{buildings.name}", crs, mask))
-    if imagery is not None:
-        _, _, image_bands = _raster_facts(imagery)
-        looks = style.rgb_style(len(image_bands))
-        tree.append(
-            _Layer("imagery", "Imagery", f"{href}/{imagery.name}", crs, looks, attribution=attribution)
+
+def _candidate_layers(candidates: Path, crs: CRS, attribution: str) -> list[_Layer]:
+    """The candidates' layer; none where there is no candidate."""
+    lonlat = candidates.suffix == ".geojson"
+    facts = pyogrio.read_info(candidates, layer=None if lonlat else candidates.stem, force_feature_count=True)
+    # A GeoJSON file without features has no geometry type, and QGIS drops such a layer.
+    if not facts["features"]:
+        return []
+    return [
+        _Layer(
+            "candidates",
+            "Candidates",
+            f"./{candidates.name}" + ("" if lonlat else f"|layername={candidates.stem}"),
+            CRS.from_epsg(4326) if lonlat else crs,
+            style.candidates_style(),
+            geometry="Point",
+            attribution=attribution,
+            expanded=True,
         )
+    ]
 
+
+def _clock(t_s: NDArray[np.float64], start_utc: datetime | None) -> _Clock:
     starts = utc_ms(start_utc, np.sort(t_s))
     step_s = float(np.median(np.diff(starts))) / 1000.0 if len(starts) > 1 else 1.0
-    clock = _Clock(int(starts[0]), int(shown_until_ms(starts)[-1]), max(round(step_s, 3), 0.001))
-    extent = (
-        _path_bounds(trajectory, [name for name, facts in found.items() if facts[0] is not None]) or bounds
-    )
-    _write(path, title, crs, extent, tree, attribution, clock)
-    return path
+    return _Clock(int(starts[0]), int(shown_until_ms(starts)[-1]), max(round(step_s, 3), 0.001))
 
 
 def style_footprints(footprints: Path) -> None:
@@ -250,17 +286,14 @@ def _vector_styles(footprints: Path) -> dict[str, tuple[Style, str]]:
 
 def _raster_facts(path: Path) -> tuple[CRS, Bounds, list[float | None]]:
     """CRS, bounds, and the radius of each band that QGIS counts (None where the band does not tell one)."""
-    try:
-        with rasterio.open(path) as src:
-            if src.crs is None:
-                raise CrsError(f"{path}: has no CRS; write it with export.cog")
-            # QGIS sees a mask inside the file as a further band, the alpha.
-            masked = src.count == 3 and MaskFlags.per_dataset in src.mask_flag_enums[0]
-            tags = [src.tags(i).get("radius_m") for i in src.indexes]
-            b = src.bounds
-            crs = CRS.from_user_input(src.crs.to_wkt())
-    except rasterio.RasterioIOError as error:
-        raise InputError(f"{path}: cannot be read as a raster ({error}); build the maps again") from error
+    with opened(path) as src:
+        if src.crs is None:
+            raise CrsError(f"{path}: has no CRS; build the maps again")
+        # QGIS sees a mask inside the file as a further band, the alpha.
+        masked = src.count == 3 and MaskFlags.per_dataset in src.mask_flag_enums[0]
+        tags = [src.tags(i).get("radius_m") for i in src.indexes]
+        b = src.bounds
+        crs = CRS.from_user_input(src.crs.to_wkt())
     return (
         crs,
         (b.left, b.bottom, b.right, b.top),
@@ -379,7 +412,7 @@ def _write(
     text = (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + ET.tostring(root, "unicode") + "\n"
     )
-    with replacing(path) as scratch, zipfile.ZipFile(scratch, "w") as archive:
+    with whole_file(path) as scratch, zipfile.ZipFile(scratch, "w") as archive:
         entry = zipfile.ZipInfo(f"{path.stem}.qgs", date_time=(1980, 1, 1, 0, 0, 0))
         entry.compress_type = zipfile.ZIP_DEFLATED
         entry.external_attr = 0o644 << 16

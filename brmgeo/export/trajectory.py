@@ -17,8 +17,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from brmgeo.export import iso_utc, qgis_style, replacing, shown_until_ms, utc_ms
+from brmgeo.export import iso_utc, qgis_style, shown_until_ms, utc_ms
 from brmgeo.export.vector import epsg_of, lonlat, number, write_geojson, write_layer
+from brmgeo.files import whole_file, write_text
 from brmgeo.flight.values import Estimate
 from brmgeo.geo.crs import parse_crs
 
@@ -155,8 +156,7 @@ def write_fixes(path: Path, estimates: Sequence[Estimate], files: Sequence[str],
         writer.writerow(
             [*row, estimate.candidate_count, f"{estimate.mass:.6g}" if math.isfinite(estimate.mass) else ""]
         )
-    with replacing(path) as scratch:
-        scratch.write_text(buffer.getvalue(), encoding="utf-8", newline="\n")
+    write_text(path, buffer.getvalue())
     return path
 
 
@@ -241,7 +241,7 @@ def write_path_gpkg(
     kept = [i for i, e in enumerate(estimates) if e.position is not None]
     tracks = _tracks(estimates, smoothed, reference)
     styles: dict[str, tuple[qgis_style.Style, str]] = {}
-    with replacing(path) as scratch:
+    with whole_file(path) as scratch:
         for name, track, runs in tracks:
             starts, ends = _spans(track, estimates if name == "online" else None, start_utc)
             angles = np.array([_angles(float(y)) for y in track.or_nan("yaw_rad")], dtype=np.float64).reshape(
@@ -316,12 +316,8 @@ def write_tum(
         "rows_without_yaw": np.flatnonzero(~yaw_known).tolist(),
     }
     sidecar = path.with_suffix(".json")
-    with replacing(path) as scratch:
-        scratch.write_text(text, encoding="ascii", newline="\n")
-    with replacing(sidecar) as scratch:
-        scratch.write_text(
-            json.dumps(facts, indent=2, ensure_ascii=False) + "\n", encoding="utf-8", newline="\n"
-        )
+    write_text(path, text)
+    write_text(sidecar, json.dumps(facts, indent=2, ensure_ascii=False) + "\n")
     return [path, sidecar]
 
 

@@ -15,7 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from brmgeo.errors import CrsError
-from brmgeo.export import replacing
+from brmgeo.files import whole_file
 from brmgeo.geo.crs import parse_crs, transformer
 
 
@@ -48,7 +48,7 @@ def number(value: float, digits: int) -> str:
 
 def write_geojson(path: Path, name: str, features: Iterable[str]) -> None:
     """A FeatureCollection of ready features (JSON text), one a line, written whole or not at all."""
-    with replacing(path) as scratch, scratch.open("w", encoding="utf-8", newline="\n") as file:
+    with whole_file(path) as scratch, scratch.open("w", encoding="utf-8", newline="\n") as file:
         file.write(f'{{"type":"FeatureCollection","name":"{name}","features":[\n')
         separator = ""
         for feature in features:
@@ -77,7 +77,7 @@ def write_layer(
         arrays.append(pa.array(values, type=kind, from_pandas=values.dtype.kind == "f"))
     # 1.3 is what the QGIS of a stable distribution reads without a warning.
     options = {"VERSION": "1.3"} if not path.exists() else {}
-    with _fixed_date():
+    with fixed_date():
         # Arrow batches are written several times faster than columns of Python objects.
         pyogrio.write_arrow(
             pa.table(arrays, names=["geom", *columns]),
@@ -93,10 +93,11 @@ def write_layer(
 
 
 @contextmanager
-def _fixed_date() -> Iterator[None]:
-    """GDAL stamps a GeoPackage with the time of writing; this gives it always the same one."""
+def fixed_date(date: str = "2000-01-01T00:00:00.000Z") -> Iterator[None]:
+    """GDAL stamps a GeoPackage with the time of writing; this gives it always the same one, so equal contents are equal
+    bytes."""
     before = pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z"})
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": date})
     try:
         yield
     finally:

@@ -58,7 +58,7 @@ def read_raster(path: Path) -> Raster:
     Raises MissingInputError where it is not there; InputError where it cannot be read, has no CRS, or its pixels are no
     squares with north up.
     """
-    with _opened(path) as src:
+    with opened(path) as src:
         place = src.transform
         crs = _crs_of(src, path)
         if place.b or place.d or place.a <= 0 or place.e != -place.a:
@@ -70,13 +70,13 @@ def box_of(path: Path) -> GeoBox:
     """The lattice of a raster; raises MissingInputError or InputError where there is no readable, placed raster."""
     from odc.geo.geobox import GeoBox
 
-    with _opened(path) as src:
+    with opened(path) as src:
         return GeoBox(src.shape, src.transform, _crs_of(src, path))
 
 
 def radii_of(path: Path) -> tuple[float, ...]:
     """Radius of each band of a ratio raster, metres; raises InputError where the raster does not state them."""
-    with _opened(path) as src:
+    with opened(path) as src:
         try:
             return tuple(float(src.tags(band)["radius_m"]) for band in src.indexes)
         except (KeyError, ValueError):
@@ -98,7 +98,7 @@ def read_window(path: Path, window: Window | None = None, bands: Sequence[int] |
     ``bands`` counts from 1. Where the window reaches outside the raster the values are the raster's nodata (0 for imagery).
     Raises MissingInputError or InputError where the raster cannot be read.
     """
-    with _opened(path) as src:
+    with opened(path) as src:
         return _read(src, path, window, bands)
 
 
@@ -108,7 +108,7 @@ def read_overview(path: Path, most_px: int) -> tuple[NDArray[Any], Bounds]:
     Bounds are (left, bottom, right, top) in the raster's CRS. Masks are picked, pictures averaged, so that a mask keeps its
     values. Raises MissingInputError or InputError where the raster cannot be read.
     """
-    with _opened(path) as src:
+    with opened(path) as src:
         shrink = max(1.0, max(src.height, src.width) / most_px)
         shape = (src.count, max(1, round(src.height / shrink)), max(1, round(src.width / shrink)))
         how = Resampling.average if src.count == 3 else Resampling.nearest
@@ -120,8 +120,8 @@ def read_overview(path: Path, most_px: int) -> tuple[NDArray[Any], Bounds]:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """A raster opened for reading, with rasterio's error turned into ours."""
+def opened(path: Path) -> Iterator[Any]:
+    """A raster opened for reading by rasterio, whose error becomes ours: MissingInputError or InputError."""
     if not Path(path).is_file():
         raise MissingInputError(f"there is no raster {path}: build the maps first")
     try:

@@ -46,8 +46,8 @@ def test_width_is_1600_and_buildings_cover_their_share(region: Region, plain: np
     with rasterio.open(region.buildings) as src:
         share = (src.read(1) == 1).mean()
     # The left panel, by its place in the figure, without the marks that lie over it.
-    left = plain[:, round(preview.LEFT * 1600) : round((preview.LEFT + 0.44) * 1600)]
-    panel = near(left, preview.BUILDING).sum() / (704 * 704 * 250 / 350)
+    left = plain[:, round(preview.LEFT * 1600) : round((preview.LEFT + preview.PANEL_W) * 1600)]
+    panel = near(left, preview.ROOF).sum() / (704 * 704 * 250 / 350)
     assert 0.75 * share < panel < 1.2 * share
 
 
