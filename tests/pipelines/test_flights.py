@@ -20,11 +20,8 @@ from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, bytes_of,
 
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
-<<<<<<< HEAD
 from brmgeo.locate.live import locate, motions_of, view_at
 from brmgeo.locate.maps import match_settings, read_maps
-=======
->>>>>>> 7a565fa (One writer of flight folders beside the one reader: what was written is read back, and flight.toml says whether a flight is simulated)
 from brmgeo.match import METHODS, GroundMap, make_matcher
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar

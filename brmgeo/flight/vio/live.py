@@ -221,7 +221,9 @@ class Vio:
         # The new readings to the filter's, which lets go of those that it has passed.
         imu = vio.imu
         if self._readings:
-            imu = _joined([(imu.t_s, imu.gyro_rad_s, imu.accel_m_s2), *self._readings])
+            joined = _joined([(imu.t_s, imu.gyro_rad_s, imu.accel_m_s2), *self._readings])
+            assert joined is not None
+            imu = joined
             self._readings.clear()
         if vio.started:
             kept = max(0, int(np.searchsorted(imu.t_s, vio.t, side="right")) - 1)
