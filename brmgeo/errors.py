@@ -9,6 +9,8 @@ The library knows no command line. Where a parameter would mend the fault, ``nee
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 def one_line(error: BaseException, most: int = 300) -> str:
     """What an error says, on one line of at most ``most`` characters; its type's name where it says nothing."""
@@ -57,3 +59,8 @@ class FlightError(InputError):
 
 class NetworkError(BrmgeoError):
     """A tile service could not be read completely."""
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """The first names and how many more there are, for a message."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -9,13 +9,14 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from brmgeo.errors import SettingsError
+from brmgeo.errors import SettingsError, WorkflowError
 
 if sys.platform == "win32":
     import msvcrt
@@ -153,6 +154,35 @@ def require_replaceable(out: Path, sign: str, what: str, ours: Callable[[Path], 
         )
 
 
+def require_writable(folder: Path) -> None:
+    """Makes a folder for results; raises WorkflowError where nothing can be written there, before any work is done."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        fault = (
+            "a file stands there"
+            if isinstance(error, (FileExistsError, NotADirectoryError))
+            else error.strerror
+        )
+        raise WorkflowError(
+            f"results cannot be written to {folder} ({fault}); choose another place"
+        ) from None
+
+
+def sync(path: Path) -> None:
+    """Waits until the disk has a file, or the names in a folder; Windows knows no such thing of folders."""
+    if sys.platform == "win32" and path.is_dir():
+        return
+    # Windows syncs only what is open for writing.
+    fd = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
 # --- contents ----------------------------------------------------------------------------------------------------
 
 
@@ -182,6 +212,30 @@ def copy(source: Path, target: Path) -> None:
             shutil.copyfileobj(reader, writer, 1 << 20)
         writer.flush()
         os.fsync(writer.fileno())
+
+
+# --- what is there -----------------------------------------------------------------------------------------------
+
+
+def files_below(folder: Path, hidden: bool = True) -> Iterator[str]:
+    """Relative names, with forward slashes, of all files below a folder; without ``hidden`` none that begins with a dot."""
+
+    def walk(path: str, prefix: str) -> Iterator[str]:
+        with os.scandir(path) as entries:
+            for entry in entries:
+                if not hidden and entry.name.startswith("."):
+                    continue
+                if entry.is_dir():
+                    yield from walk(entry.path, f"{prefix}{entry.name}/")
+                else:
+                    yield f"{prefix}{entry.name}"
+
+    return walk(str(folder), "")
+
+
+def folders_below(folder: Path) -> list[Path]:
+    """All folders below a folder, the innermost first."""
+    return [Path(top) / name for top, names, _ in os.walk(folder, topdown=False) for name in names]
 
 
 # --- locks -------------------------------------------------------------------------------------------------------

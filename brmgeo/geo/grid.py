@@ -7,9 +7,9 @@ region is a window of it, so cropping, padding and overlapping are exact integer
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from affine import Affine
@@ -47,6 +47,17 @@ def bounds_of(box: GeoBox) -> Bounds:
     """(left, bottom, right, top) of a lattice in its own CRS."""
     b = box.extent.boundingbox
     return (b.left, b.bottom, b.right, b.top)
+
+
+def as_bounds(values: Iterable[Any]) -> Bounds:
+    """Four numbers of an array or a file as (left, bottom, right, top)."""
+    left, bottom, right, top = (float(v) for v in values)
+    return (left, bottom, right, top)
+
+
+def shape_of(box: GeoBox) -> tuple[int, int]:
+    """(rows, cols) of a lattice."""
+    return int(box.shape[0]), int(box.shape[1])
 
 
 def gsd_of(box: GeoBox) -> float:
