@@ -162,16 +162,16 @@ def maps(
         spec = job.region_of_files(
             out,
             footprints,
-            crs,
-            imagery,
-            sheets,
-            bounds,
-            0.5 if gsd_m is None else gsd_m,
-            radii_m,
-            layer,
-            encoding,
-            source_crs,
-            repairs,
+            crs=crs,
+            imagery=imagery,
+            sheets=sheets,
+            bounds=bounds,
+            gsd_m=gsd_m,
+            radii_m=radii_m,
+            layer=layer,
+            encoding=encoding,
+            source_crs=source_crs,
+            repairs=repairs,
         )
         job.build_maps(spec, out / ".brmgeo", out, Path.cwd(), scheduler)
         return
@@ -239,8 +239,11 @@ def tiles(
 ) -> None:
     """Cut training tiles (image + label pairs) of REGIONS, or make them of foreign --pairs."""
     from pipelines import training as job
+    from pipelines.trainable import require_all_trainable
 
     if pairs is not None:
+        from pipelines.training_pairs import cut_pairs
+
         if regions or align:
             raise SettingsError(
                 "tiles --pairs: leave REGION and --align out; pairs have neither map nor place"
@@ -253,8 +256,17 @@ def tiles(
             raise SettingsError(
                 "tiles --pairs: pairs have no place to make blocks of; give train, validation or test"
             )
-        what = (name or "pairs", split or "train", attribution, terms)
-        job.cut_pairs(*pairs, out, gsd_m[0], *what, scheduler, empty_share)
+        cut_pairs(
+            *pairs,
+            out,
+            gsd_m=gsd_m[0],
+            name=name or "pairs",
+            split=split or "train",
+            attribution=attribution,
+            terms=terms,
+            scheduler_spec=scheduler,
+            empty_share=empty_share,
+        )
         return
     if not regions:
         raise SettingsError(
@@ -271,7 +283,7 @@ def tiles(
     for option, value in given.items():
         if value is not None:
             raise SettingsError(f"tiles: {option} goes with --pairs; a region's own is in its TOML file")
-    job.require_all_trainable(regions, data, split)
+    require_all_trainable(regions, data, split)
     for region in regions:
         job.cut_region(region, data, out, scheduler, split, gsd_m, align)
 

@@ -56,7 +56,8 @@ from brmgeo.region import FlightSettings, Region
 from brmgeo.synth.mission import photographed
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler, serial_map
-from pipelines.maps import NativeImagery, native_imagery
+from pipelines.map_sources import NativeImagery
+from pipelines.maps import native_imagery
 from pipelines.odometry import odometry_name, own_odometry
 from pipelines.regions import region_named, town_style
 
@@ -1110,7 +1111,8 @@ def maps_for(
 
     With ``maps_dir`` in place of a region the settings are the defaults.
     """
-    from pipelines.maps import build_region, credits
+    from pipelines.map_sources import credits
+    from pipelines.maps import build_region
 
     if (region is None) == (maps_dir is None):
         raise SettingsError(

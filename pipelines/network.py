@@ -96,7 +96,7 @@ def read_pairs(folder: Path) -> tuple[list[str], list[U8], list[U8]]:
     Transparent pixels and plain black or white areas are unknown. Raises MissingInputError where there are none or one
     of a pair is missing, InputError for unreadable, cut short or unequal ones and for more than 8 bits.
     """
-    from pipelines import training
+    from brmgeo.segment.pairs import read_pair
 
     names, images, labels = [], [], []
     pictures = sorted(p for p in (folder / "images").glob("*") if p.suffix.lower() in _PICTURES)
@@ -110,7 +110,7 @@ def read_pairs(folder: Path) -> tuple[list[str], list[U8], list[U8]]:
             raise MissingInputError(
                 f"{mask_path}: is not there, but {path.name} is: every image needs its mask"
             )
-        image, label = training.read_pair(path, mask_path)
+        image, label = read_pair(path, mask_path)
         names.append(path.stem)
         images.append(image)
         labels.append(label)
@@ -317,7 +317,7 @@ def gather(
 
 def with_terms(spec: SourceSpec, data: Path, paths: Mapping[str, Path]) -> SourceSpec:
     """A source of tiles with what its regions' files, or its folder, say of attribution and terms."""
-    from pipelines.maps import credits
+    from pipelines.map_sources import credits
     from pipelines.regions import region_named
 
     if not spec.regions:
@@ -350,7 +350,7 @@ def _checked(
     say: Callable[[str], None],
 ) -> list[SourceSpec]:
     """The sources to be read, all looked at before the first is painted or read; see ``gather`` for what is raised."""
-    from pipelines import training
+    from pipelines.trainable import require_all_trainable
 
     names = {
         s.name
@@ -399,7 +399,7 @@ def _checked(
         if spec.kind == "pairs" and (spec.gsd_m is None or spec.split != "train"):
             raise SettingsError(f"recipe source {spec.name}: pairs are for training, and need their gsd_m")
         if spec.kind == "tiles":
-            training.require_all_trainable(spec.regions, data, spec.split)
+            require_all_trainable(spec.regions, data, spec.split)
             if spec.name in paths:
                 _require_usable(spec, paths, data)
         if spec.name not in names or spec.name in paths:
@@ -415,7 +415,7 @@ def _checked(
 
 def _require_usable(spec: SourceSpec, paths: Mapping[str, Path], data: Path) -> None:
     """Raises SettingsError for a folder of tiles that are for testing, or that another source names too."""
-    from pipelines import training
+    from pipelines.trainable import require_trainable
 
     folder = paths[spec.name]
     for name, other in paths.items():
@@ -434,7 +434,7 @@ def _require_usable(spec: SourceSpec, paths: Mapping[str, Path], data: Path) -> 
         )
     for region in sorted({info.region for info in tiles.infos}):
         if (file := data / "regions" / f"{region}.toml").is_file():
-            training.require_trainable(load_region(file), data)
+            require_trainable(load_region(file), data)
 
 
 def _held_seeds(data: Path) -> dict[int, str]:

@@ -210,3 +210,9 @@ def _belt(name: str, lon_deg: float) -> str:
 def where_to_get(sheet: str) -> str:
     """How a person gets an NGII sheet, in half a sentence."""
     return f"{NGII} (국토정보플랫폼, 수치지형도, sheet {sheet}; free after registering)"
+
+
+def safe_name(text: str) -> str:
+    """The text as the name of a region or folder: ASCII letters, digits, - and _."""
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in text).strip("-_")
+    return name[:64] or "region"

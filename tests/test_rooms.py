@@ -52,6 +52,7 @@ ADAPTERS = {
     "brmgeo.flight.poses",
     "brmgeo.flight.tables",
     "brmgeo.segment.shards",
+    "brmgeo.segment.pairs",
 }
 # What each room may import besides itself and plain values; everything not named here may not be known.
 MAY_KNOW = {

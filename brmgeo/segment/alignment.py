@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from brmgeo.geo.grid import Bounds
+
 _SMOOTH_M = 0.35
 _OUTLINE_M = 120.0  # about three houses: less may fit a hedge by chance
 # Maps laid over wrong ground (80 blocks of a generated town) reached a quality of 6.1 and a lead of 1.6, seldom both.
@@ -140,6 +142,27 @@ def region_offset(blocks: Sequence[BlockOffset]) -> RegionOffset:
     if sigma > 1.0:
         return RegionOffset(math.nan, math.nan, sigma, spread, len(told), len(blocks), "cannot tell")
     return RegionOffset(float(middle[0]), float(middle[1]), sigma, spread, len(told), len(blocks), "told")
+
+
+def offset_at(
+    blocks: NDArray[np.float64], whole: NDArray[np.float64], side_m: float, bounds: Bounds
+) -> tuple[float, float]:
+    """(dx, dy) in metres by which the labels within ``bounds`` are moved: the median of the blocks about it that tell.
+
+    Where fewer than three of them do, the region's; none where that cannot tell either.
+
+    Args:
+        blocks: (n, 4) float64 middle x, y and offset dx, dy of the blocks that tell.
+        whole: (2,) float64 offset of the region, zero where it cannot tell.
+        side_m: of a block.
+        bounds: (left, bottom, right, top).
+    """
+    if not whole.any():
+        return (0.0, 0.0)  # what the region does not tell, its blocks tell by chance
+    x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    near = blocks[np.abs(blocks[:, :2] - (x, y)).max(axis=1) <= 1.5 * side_m, 2:]
+    dx, dy = np.median(near, axis=0) if len(near) >= 3 else whole
+    return (float(dx), float(dy))
 
 
 def _double_angle(gx: NDArray[np.float32], gy: NDArray[np.float32]) -> tuple[Complex, NDArray[np.float32]]:

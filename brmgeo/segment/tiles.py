@@ -10,7 +10,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,7 @@ from brmgeo.segment import BUILDING as BUILDING
 from brmgeo.segment import OTHER
 from brmgeo.segment import UNKNOWN as UNKNOWN
 
+COARSE = 8  # clouds are looked for in pixels this many times larger
 _BLANK_STD = 2.0  # grey levels: flat water keeps more than this at any GSD, a placeholder picture less
 _CLOUD_BRIGHT = 190
 _CLOUD_COLOUR = 28
@@ -176,6 +179,26 @@ def picture_fault(
     return "cloudy" if cloud.sum() > cloud_share * ground.sum() else None
 
 
+def pair_fault(image: NDArray[np.uint8], label: NDArray[np.uint8], cloud_share: float) -> str | None:
+    """Why the picture of a foreign pair is left out, as ``picture_fault``; None where it is not.
+
+    Blank as it is, cloudy as the survey of a region sees it: in pixels COARSE times larger.
+
+    Args:
+        image: (h, w, 3) uint8 RGB.
+        label: (h, w) uint8.
+        cloud_share: the largest share of the ground that may be cloud.
+    """
+    fault = picture_fault(image, label != UNKNOWN)
+    rows, cols = (n // COARSE for n in label.shape)
+    seen = label[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE][:rows, :cols]
+    if fault is not None or not (seen == OTHER).any():
+        return fault
+    whole = image[: rows * COARSE, : cols * COARSE]
+    small = np.asarray(cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return picture_fault(small, seen != UNKNOWN, seen == OTHER, cloud_share)
+
+
 def _mean3(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mean over 3 x 3 pixels, edges repeated."""
     padded = np.pad(values, 1, mode="edge")
@@ -245,6 +268,27 @@ class Tally:
         mean = [s / known for s in self.colour_sum]
         spread = [max(q / known - m * m, 0.0) ** 0.5 for q, m in zip(self.colour_square, mean, strict=True)]
         return [m / 255 for m in mean], [s / 255 for s in spread]
+
+    def told(self) -> dict[str, Any]:
+        """The counts and what follows from them, for tiles.json."""
+        known = self.building + self.other
+        return {
+            "tiles": self.tiles,
+            "empty_tiles": self.empty,
+            "empty_share": round(self.empty / self.tiles, 4),
+            "pixels": {"building": self.building, "other": self.other, "unknown": self.unknown},
+            "building_share": round(self.building / known, 6) if known else None,
+            # How many other pixels stand against one of a building: the weight that evens them out.
+            "other_per_building": round(self.other / self.building, 4) if self.building else None,
+            **self.colour_told(),
+        }
+
+    def colour_told(self) -> dict[str, list[float] | None]:
+        """Mean and standard deviation of each channel, 0 to 1, to six digits; None where no pixel is known."""
+        colour = self.colour()
+        if colour is None:
+            return {"mean": None, "std": None}
+        return {"mean": [round(v, 6) for v in colour[0]], "std": [round(v, 6) for v in colour[1]]}
 
 
 def _plus(a: Sequence[int], b: Sequence[int]) -> tuple[int, int, int]:

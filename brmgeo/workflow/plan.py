@@ -9,12 +9,12 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from brmgeo.errors import BrmgeoError, WorkflowError
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import serial_map
-from brmgeo.workflow.stage import Json, Map, Stage, canonical
+from brmgeo.workflow.stage import Json, Map, S, Stage, canonical
 from brmgeo.workflow.store import Artifact, Input, Step, Store
 
 
@@ -44,15 +44,15 @@ class Plan:
     def __init__(self, store: Store, region: str) -> None:
         self.store = store
         self.region = region
-        self.steps: dict[str, Step] = {}
+        self.steps: dict[str, Step[Any]] = {}
 
     def add(
         self,
-        stage: Stage,
+        stage: Stage[S],
         inputs: Mapping[str, Input],
-        settings: Mapping[str, object],
+        settings: S,
         label: str | None = None,
-    ) -> Step:
+    ) -> Step[S]:
         """Keys a step and appends it; see ``Store.step``. Several steps of one stage need labels of their own."""
         step = self.store.step(stage, inputs, settings, label)
         if step.label in self.steps:
@@ -87,9 +87,9 @@ class Plan:
                 made[step.label] = replace(self.store.build(step, map), fresh=step in missing)
         return made
 
-    def _groups(self) -> list[list[Step]]:
+    def _groups(self) -> list[list[Step[Any]]]:
         """The steps in order, neighbours of one stage together as long as none of them needs another."""
-        groups: list[list[Step]] = []
+        groups: list[list[Step[Any]]] = []
         for step in self.steps.values():
             group = groups[-1] if groups else []
             if group and group[0].stage == step.stage and not any(i in group for i in step.inputs.values()):
@@ -98,7 +98,7 @@ class Plan:
                 groups.append([step])
         return groups
 
-    def _build_side_by_side(self, steps: Sequence[Step], map: Map) -> None:
+    def _build_side_by_side(self, steps: Sequence[Step[Any]], map: Map) -> None:
         errors = []
         for step, error in zip(steps, map(functools.partial(_build_alone, self.store.root), steps)):
             if error is None:
@@ -131,7 +131,7 @@ class Plan:
             ]
         return [f"{label} is {status.state}:", *(f"  {line}" for line in status.reasons)]
 
-    def _status(self, step: Step, verify: bool) -> StepStatus:
+    def _status(self, step: Step[Any], verify: bool) -> StepStatus:
         def answer(state: Literal["fresh", "stale", "missing", "damaged"], *reasons: str) -> StepStatus:
             return StepStatus(step.label, state, step.key, step.path, reasons)
 
@@ -150,7 +150,7 @@ class Plan:
         return answer("stale", *changes(before, step.origin))
 
 
-def _build_alone(root: Path, step: Step) -> BrmgeoError | None:
+def _build_alone(root: Path, step: Step[Any]) -> BrmgeoError | None:
     """Builds one step within this process; an error of its input is returned, so that its neighbours go on."""
     try:
         Store(root).build(step, serial_map)

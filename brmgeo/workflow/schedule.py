@@ -221,7 +221,7 @@ class _Dask:
         token = self._shared / f".seen-{uuid.uuid4().hex}"
         token.touch()
         try:
-            answers = client.run(_look_around, str(token), on_error="return")
+            answers = client.run(look_around, str(token), on_error="return")
         finally:
             token.unlink(missing_ok=True)
         mine = _house()
@@ -250,7 +250,8 @@ def _house() -> str:
     return f"brmgeo {brmgeo.__version__} ({digest.hexdigest()[:8]}) on Python {sys.version_info[0]}.{sys.version_info[1]}"
 
 
-def _look_around(token: str) -> tuple[bool, str]:
+def look_around(token: str) -> tuple[bool, str]:
+    """What a worker answers: whether it sees a file of ours, and which house it runs (see ``_house``)."""
     return os.path.exists(token), _house()
 
 

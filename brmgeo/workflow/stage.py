@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
+
+from brmgeo.files import digest_of
 
 T = TypeVar("T")
 R = TypeVar("R")
+S = TypeVar("S")
 
 Json = Any
 """What ``json.loads`` returns: dict, list, str, int, float, bool or None."""
@@ -35,12 +37,23 @@ class Map(Protocol):
         ...  # pragma: no cover
 
 
-Run = Callable[[Mapping[str, Path], Path, dict[str, Json], Map], Mapping[str, Json]]
+Run = Callable[[Mapping[str, Path], Path, S, Map], Mapping[str, Json]]
 """``run(inputs, out, settings, map) -> facts``: see ``Stage``."""
+
+_UNSTATED = "unstated"
+
+
+def unstated(default: T) -> T:
+    """A field of a stage's settings that has no place in the key while it has its default.
+
+    So a setting can be added and what was made before there was a choice stays fresh.
+    """
+    field: Any = dataclasses.field(default=default, metadata={_UNSTATED: True})
+    return field  # type: ignore[no-any-return]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Stage:
+class Stage(Generic[S]):
     """One kind of step.
 
     Attributes:
@@ -48,13 +61,14 @@ class Stage:
         version: raised by hand whenever the same inputs and settings would give another result.
         run: ``run(inputs, out, settings, map) -> facts``. ``inputs`` maps names to paths (folders of upstream
             artifacts, source files or folders), ``out`` is an empty folder, named by the artifact's key, that takes
-            the outputs, ``settings`` is a plain dict as JSON would return it, ``map`` fans out over workers (who get
-            paths and windows, and open their own handles). The returned facts are JSON-able and go into the record.
+            the outputs, ``settings`` is the stage's own frozen dataclass, which can be pickled, ``map`` fans out over
+            workers (who get paths and windows, and open their own handles). The returned facts are JSON-able and go into
+            the record.
     """
 
     name: str
     version: int
-    run: Run
+    run: Run[S]
 
     def __post_init__(self) -> None:
         if not self.name or not all(c.isalnum() or c in "-_" for c in self.name):
@@ -62,10 +76,12 @@ class Stage:
 
 
 def plain(value: object, where: str = "settings") -> Json:
-    """``value`` as JSON values: mappings to dict, sequences and sets to list, NumPy scalars to numbers, enums to values.
+    """``value`` as JSON values: mappings and dataclasses to dict, sequences and sets to list, NumPy scalars to numbers,
+    enums to values.
 
-    1 and 1.0 stay different, -0.0 becomes 0.0. Raises TypeError for what has no unambiguous text
-    (NaN, infinity, paths, keys that are not strings, other objects): that is a defect of the caller.
+    Fields that are ``unstated`` and at their default are left out; 1 and 1.0 stay different, -0.0 becomes 0.0. Raises
+    TypeError for what has no unambiguous text (NaN, infinity, paths, keys that are not strings, other objects): that is
+    a defect of the caller.
     """
     if isinstance(value, enum.Enum):
         return plain(value.value, where)
@@ -78,7 +94,9 @@ def plain(value: object, where: str = "settings") -> Json:
             raise TypeError(f"{where}: {value} has no place in a key or record; leave it out or use None")
         return float(value) + 0.0
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return plain({f.name: getattr(value, f.name) for f in dataclasses.fields(value)}, where)
+        return plain(
+            {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if _is_stated(value, f)}, where
+        )
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str):
@@ -93,14 +111,18 @@ def plain(value: object, where: str = "settings") -> Json:
     raise TypeError(f"{where}: {type(value).__name__} cannot be written as JSON: {value!r}")
 
 
+def _is_stated(value: object, field: dataclasses.Field[Any]) -> bool:
+    return not field.metadata.get(_UNSTATED) or getattr(value, field.name) != field.default
+
+
 def canonical(value: Json) -> str:
     """The one JSON text of a plain value: sorted keys, no spaces, shortest floats."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
-def key_of(stage: Stage, settings: Json, input_keys: Mapping[str, str]) -> str:
+def key_of(stage: Stage[Any], settings: Json, input_keys: Mapping[str, str]) -> str:
     """64 hexadecimal digits: the key of a stage with plain ``settings`` and the keys of its inputs by name."""
     text = canonical(
         {"stage": stage.name, "version": stage.version, "settings": settings, "inputs": dict(input_keys)}
     )
-    return hashlib.sha256(text.encode()).hexdigest()
+    return digest_of(text)

@@ -16,7 +16,7 @@ import rasterio
 from PIL import Image
 from small_maps import SHEETS, SmallRegion, brmgeo, rasters_of
 
-from pipelines import maps
+from pipelines import map_stages
 
 STAGES = (
     *(f"outlines {s}" for s in SHEETS),
@@ -140,7 +140,7 @@ def test_two_workers_and_small_blocks_give_the_same_bytes(
     built: SmallRegion, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     region = built.copied_to(tmp_path / "data", store=False)
-    monkeypatch.setattr(maps, "BLOCK_PX", 256)
+    monkeypatch.setattr(map_stages, "BLOCK_PX", 256)
     monkeypatch.setenv("SCHEDULER", "local")
     said = brmgeo(capsys, "maps", "small", "--data", region.data)
     assert said.status == 0, said.err

@@ -29,7 +29,9 @@ from brmgeo.synth.imagery import render_imagery
 from brmgeo.synth.town import generate_town
 from brmgeo.workflow.store import Store
 from pipelines.cli import cli, run
-from pipelines.training import held_ground, none_left, plan_tiles, require_trainable
+from pipelines.trainable import held_ground, require_trainable
+from pipelines.training_plan import plan_tiles
+from pipelines.training_stages import none_left
 
 Capture = pytest.CaptureFixture[str]
 REAL = Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
@@ -294,7 +296,7 @@ def test_real_ground_that_is_held_out_is_kept_out_of_neighbours(
     assert [name for name, _ in held] == ["other"]
     assert held[0][1][0] == pytest.approx(right - 60 - 12)
     plan, _ = plan_tiles(own, Store(tmp_path / "work"), region.data)
-    assert plan.steps["tile-survey"].settings["held"][0][0] == "other"
+    assert plan.steps["tile-survey"].settings.held[0][0] == "other"
     assert cut(capsys, region, "--gsd", "1.7", "--split", "train").status == 0
     tiles = tiles_of(region)
     assert tiles.facts["survey"]["dropped"]["held-out ground"] > 0
@@ -614,7 +616,7 @@ def test_names_that_a_key_cannot_tell_apart_get_numbers(pairs: tuple[Path, Path]
         ("other size", "64 x 40 px, its image"),
         ("16 bit", "holds uint16 values"),
         ("damaged", "damaged or cut short"),
-        ("no picture", "is not a readable picture"),
+        ("no picture", "no picture that can be decoded"),
         ("cut short", "damaged or cut short"),
         ("same name", "several pictures named p 3"),
         ("tiny", "training tiles have 32 to 8192 px"),
@@ -722,9 +724,10 @@ def test_a_style_changes_only_the_regions_that_name_one(tmp_path: Path) -> None:
     store = Store(tmp_path / "work")
     demo, _ = plan_tiles(load_region(REGIONS / "demo.toml"), store, tmp_path)
     town, names = plan_tiles(load_region(REGIONS / "town-a.toml"), store, tmp_path)
-    assert demo.steps["source"].settings.keys() == {"seed", "sheets", "bounds", "crs", "level"}
-    assert town.steps["source"].settings["style"] == 28
-    assert demo.steps["tile-survey"].settings["split"] == "test"
+    keyed = demo.steps["source"].origin["settings"]
+    assert keyed.keys() == {"seed", "sheets", "bounds", "crs", "level"}
+    assert town.steps["source"].origin["settings"]["style"] == town.steps["source"].settings.style == 28
+    assert demo.steps["tile-survey"].settings.split == "test"
     assert set(names) <= set(town.steps)
     assert bounds_of(lattice(BOUNDS, CRS, 0.5)) == BOUNDS
-    assert json.dumps(town.steps["tile-index"].settings)
+    assert json.dumps(town.steps["tile-index"].origin["settings"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,26 @@ from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.stage import Stage
 from brmgeo.workflow.store import Store
+
+
+@dataclass(frozen=True)
+class Grid:
+    gsd_m: float
+    crs: str
+
+
+@dataclass(frozen=True)
+class Before:
+    radii_m: tuple[float, ...]
+    grid: Grid
+    old: int
+
+
+@dataclass(frozen=True)
+class After:
+    radii_m: tuple[float, ...]
+    grid: Grid
+    new: int | None
 
 
 @pytest.fixture
@@ -58,9 +79,9 @@ def test_a_warm_run_computes_nothing(tmp_path: Path, source: Path) -> None:
 def test_only_what_depends_on_a_change_runs_again(tmp_path: Path, source: Path) -> None:
     def plan(words: int, noise: int) -> Plan:
         p = Plan(Store(tmp_path / "store"), "toy")
-        first = p.add(toys.WORDS, {"text": source}, {"times": words})
-        p.add(toys.SQUARES, {"words": first}, {})
-        p.add(toys.NOISE, {}, {"blocks": noise})
+        first = p.add(toys.WORDS, {"text": source}, toys.Words(words))
+        p.add(toys.SQUARES, {"words": first}, toys.Nothing())
+        p.add(toys.NOISE, {}, toys.Noise(noise))
         return p
 
     plan(1, 1).build()
@@ -79,13 +100,16 @@ def test_only_what_depends_on_a_change_runs_again(tmp_path: Path, source: Path) 
 def test_why_names_the_settings_that_changed(tmp_path: Path, source: Path) -> None:
     store = Store(tmp_path / "store")
 
-    def plan(version: int, settings: dict[str, object]) -> Plan:
+    def run(inputs: object, out: Path, settings: object, map: object) -> dict[str, int]:
+        return {}
+
+    def plan(version: int, settings: Before | After) -> Plan:
         p = Plan(store, "toy")
-        p.add(Stage("words", version, toys.run_words), {"text": source}, settings)
+        p.add(Stage("words", version, run), {"text": source}, settings)
         return p
 
-    plan(1, {"radii_m": [78.8], "grid": {"gsd_m": 0.5, "crs": "EPSG:5187"}, "old": 1}).build()
-    after = plan(2, {"radii_m": [118.2, 39.4], "grid": {"gsd_m": 0.25, "crs": "EPSG:5187"}, "new": None})
+    plan(1, Before((78.8,), Grid(0.5, "EPSG:5187"), 1)).build()
+    after = plan(2, After((118.2, 39.4), Grid(0.25, "EPSG:5187"), None))
     assert after.why("words") == [
         "words is stale:",
         "  version: 1 -> 2",
@@ -105,8 +129,8 @@ def test_why_names_the_sources_that_changed(tmp_path: Path, source: Path) -> Non
     def plan(*names: str) -> Plan:
         p = Plan(Store(tmp_path / "store"), "toy")
         places = {"sheets/1.dxf": source, "sheets/2.dxf": source, "text": source, "tiles": tiles}
-        first = p.add(toys.WORDS, {name: places[name] for name in ("text", *names)}, {})
-        p.add(toys.SQUARES, {"words": first}, {})
+        first = p.add(toys.WORDS, {name: places[name] for name in ("text", *names)}, toys.Words())
+        p.add(toys.SQUARES, {"words": first}, toys.Nothing())
         return p
 
     plan("sheets/1.dxf", "tiles").build()
@@ -155,5 +179,5 @@ def test_unknown_and_repeated_labels(tmp_path: Path, source: Path) -> None:
     with pytest.raises(WorkflowError, match="no stage 'ratio': it has words, squares"):
         plan.why("ratio")
     with pytest.raises(ValueError, match="two steps"):
-        plan.add(toys.WORDS, {"text": source}, {"times": 3})
-    assert plan.add(toys.WORDS, {"text": source}, {"times": 3}, label="more").label == "more"
+        plan.add(toys.WORDS, {"text": source}, toys.Words(3))
+    assert plan.add(toys.WORDS, {"text": source}, toys.Words(3), label="more").label == "more"

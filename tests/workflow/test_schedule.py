@@ -63,7 +63,7 @@ def test_serial_and_distributed_artifacts_are_the_same_bytes(two_workers: Map, t
     made = []
     for name, map in (("serial", serial_map), ("distributed", two_workers)):
         store = Store(tmp_path / name)
-        made.append(store.build(store.step(toys.NOISE, {}, {"blocks": 12}), map))
+        made.append(store.build(store.step(toys.NOISE, {}, toys.Noise(12)), map))
     assert made[0].key == made[1].key
     assert made[0].record["outputs"] == made[1].record["outputs"]
     assert made[0].facts == made[1].facts
@@ -173,7 +173,7 @@ schedule._has_dashboard = lambda: False  # it starts quicker so
 
 def run(inputs, out, settings, map):
     with open(out / "squares.txt", "w") as handle:
-        for square in map(toys.slow_square, range(settings["n"])):
+        for square in map(toys.slow_square, range(settings.blocks)):
             print(square, file=handle, flush=True)
             if square == 100:
                 print("halfway", flush=True)
@@ -182,7 +182,7 @@ def run(inputs, out, settings, map):
 if __name__ == "__main__":
     store = Store(sys.argv[2])
     plan = Plan(store, "toy")
-    plan.add(Stage("squares", 1, run), {}, {"n": 24})
+    plan.add(Stage("squares", 1, run), {}, toys.Noise(24))
     with store.lock("toy"), schedule.scheduler(sys.argv[3], shared=store.root, workers=2) as map:
         made = plan.build(map)
         print((made["squares"].path / "squares.txt").read_text().split()[-1])
@@ -288,7 +288,7 @@ def test_workers_with_another_brmgeo_or_disk_are_refused(
             scheduler(address, shared=tmp_path) as map,
         ):
             list(map(toys.square, range(3)))
-    monkeypatch.setattr("brmgeo.workflow.schedule._look_around", toys.look_around_elsewhere)
+    monkeypatch.setattr("brmgeo.workflow.schedule.look_around", toys.look_around_elsewhere)
     with (
         pytest.raises(WorkflowError, match=f"does not see {tmp_path}; mount"),
         scheduler(address, shared=tmp_path) as map,

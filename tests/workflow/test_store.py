@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brmgeo.errors import InputError, MissingInputError, WorkflowError
+from brmgeo.workflow.publish import publish
 from brmgeo.workflow.schedule import serial_map
-from brmgeo.workflow.stage import Json, Map, Stage, canonical, key_of, plain
-from brmgeo.workflow.store import RECORD, Artifact, Store, publish
+from brmgeo.workflow.stage import Json, Map, Stage, canonical, key_of, plain, unstated
+from brmgeo.workflow.store import RECORD, Artifact, Store
 
 HERE = Path(__file__).parent
 
@@ -67,8 +69,8 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "store")
 
 
-def words(store: Store, source: Path, **settings: object) -> Artifact:
-    return store.build(store.step(toys.WORDS, {"text": source}, settings), serial_map)
+def words(store: Store, source: Path, times: int = 1) -> Artifact:
+    return store.build(store.step(toys.WORDS, {"text": source}, toys.Words(times)), serial_map)
 
 
 def one_line(error: pytest.ExceptionInfo[Exception]) -> str:
@@ -171,25 +173,25 @@ def test_stage_name_names_a_folder() -> None:
 
 
 def test_source_counts_by_content_not_by_place_or_time(store: Store, source: Path, tmp_path: Path) -> None:
-    key = store.step(toys.WORDS, {"text": source}, {}).key
+    key = store.step(toys.WORDS, {"text": source}, toys.Words()).key
     copy = tmp_path / "elsewhere" / "other-name.txt"
     copy.parent.mkdir()
     shutil.copyfile(source, copy)
-    assert store.step(toys.WORDS, {"text": copy}, {}).key == key
+    assert store.step(toys.WORDS, {"text": copy}, toys.Words()).key == key
     copy.write_text("another text")
-    assert store.step(toys.WORDS, {"text": copy}, {}).key != key
+    assert store.step(toys.WORDS, {"text": copy}, toys.Words()).key != key
 
 
 def test_same_size_and_time_do_not_hide_a_change(store: Store, source: Path) -> None:
-    before = store.step(toys.WORDS, {"text": source}, {}).key
+    before = store.step(toys.WORDS, {"text": source}, toys.Words()).key
     source.write_text(source.read_text().swapcase())
     os.utime(source, (1e9, 1e9))
-    assert Store(store.root).step(toys.WORDS, {"text": source}, {}).key != before
+    assert Store(store.root).step(toys.WORDS, {"text": source}, toys.Words()).key != before
 
 
 def test_folder_counts_by_names_and_contents(store: Store, tmp_path: Path) -> None:
     def key() -> str:
-        return store.step(toys.WORDS, {"tiles": tmp_path / "tiles"}, {}).key
+        return store.step(toys.WORDS, {"tiles": tmp_path / "tiles"}, toys.Words()).key
 
     deep = tmp_path / "tiles" / "1" / "2"
     deep.mkdir(parents=True)
@@ -210,12 +212,10 @@ def test_folder_counts_by_names_and_contents(store: Store, tmp_path: Path) -> No
 def test_digests_are_kept_between_runs(
     store: Store, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key = store.step(toys.WORDS, {"text": source}, {}).key
+    key = store.step(toys.WORDS, {"text": source}, toys.Words()).key
     _settle(store, source)
-    monkeypatch.setattr(
-        "brmgeo.workflow.store._hash_file", lambda path: pytest.fail(f"{path} was read again")
-    )
-    assert Store(store.root).step(toys.WORDS, {"text": source}, {}).key == key
+    monkeypatch.setattr("brmgeo.files.digest", lambda path: pytest.fail(f"{path} was read again"))
+    assert Store(store.root).step(toys.WORDS, {"text": source}, toys.Words()).key == key
 
 
 def _settle(store: Store, source: Path) -> None:
@@ -225,18 +225,18 @@ def _settle(store: Store, source: Path) -> None:
     while not kept.exists() or str(source) not in json.loads(kept.read_text()):
         assert time.monotonic() < deadline
         time.sleep(0.2)
-        Store(store.root).step(toys.WORDS, {"text": source}, {})
+        Store(store.root).step(toys.WORDS, {"text": source}, toys.Words())
 
 
 def test_damaged_digests_are_only_forgotten(store: Store, source: Path) -> None:
-    key = store.step(toys.WORDS, {"text": source}, {}).key
+    key = store.step(toys.WORDS, {"text": source}, toys.Words()).key
     (store.root / "digests.json").write_text('{"half a fi')
-    assert Store(store.root).step(toys.WORDS, {"text": source}, {}).key == key
+    assert Store(store.root).step(toys.WORDS, {"text": source}, toys.Words()).key == key
 
 
 def test_missing_source_is_named(store: Store, tmp_path: Path) -> None:
     with pytest.raises(MissingInputError) as error:
-        store.step(toys.WORDS, {"text": tmp_path / "no.txt"}, {})
+        store.step(toys.WORDS, {"text": tmp_path / "no.txt"}, toys.Words())
     assert "input text of stage words" in one_line(error)
     assert str(tmp_path / "no.txt") in one_line(error)
 
@@ -247,7 +247,7 @@ def test_source_that_changes_during_a_stage_is_refused(store: Store, source: Pat
         (out / "a.txt").write_text("a")
         return {}
 
-    step = store.step(Stage("meddling", 1, run), {"text": source}, {})
+    step = store.step(Stage("meddling", 1, run), {"text": source}, toys.Nothing())
     with pytest.raises(WorkflowError, match="changed while it was in use") as error:
         store.build(step, serial_map)
     assert str(source) in one_line(error)
@@ -271,7 +271,7 @@ def test_second_build_runs_nothing(store: Store, source: Path) -> None:
 
 def test_record_tells_where_the_outputs_come_from(store: Store, source: Path) -> None:
     first = words(store, source, times=2)
-    step = store.step(toys.SQUARES, {"words": first}, {})
+    step = store.step(toys.SQUARES, {"words": first}, toys.Nothing())
     second = store.build(step, serial_map)
     record = json.loads((second.path / RECORD).read_text())
     assert record == second.record
@@ -285,27 +285,62 @@ def test_record_tells_where_the_outputs_come_from(store: Store, source: Path) ->
 
 
 def test_inputs_are_built_on_demand(store: Store, source: Path) -> None:
-    first = store.step(toys.WORDS, {"text": source}, {})
-    second = store.step(toys.SQUARES, {"words": first}, {})
+    first = store.step(toys.WORDS, {"text": source}, toys.Words())
+    second = store.step(toys.SQUARES, {"words": first}, toys.Nothing())
     assert not toys.CALLS
     store.build(second, serial_map)
     assert toys.CALLS == ["words", "squares"]
     assert store.find(first) is not None
 
 
-def test_stage_gets_its_own_copy_of_the_settings(store: Store) -> None:
-    def run(inputs: object, out: Path, settings: dict[str, Json], map: object) -> dict[str, Json]:
-        settings["list"].append(4)
-        return settings
+def test_a_stage_gets_the_value_that_was_keyed(store: Store) -> None:
+    @dataclass(frozen=True)
+    class Own:
+        radii_m: tuple[float, ...]
+        style: int | None = unstated(None)
 
-    step = store.step(Stage("meddling", 1, run), {}, {"list": (1, 2)})
-    made = store.build(step, serial_map)
-    assert made.facts == {"list": [1, 2, 4]}
-    assert made.record["settings"] == {"list": [1, 2]}
+    given = []
+
+    def run(inputs: object, out: Path, settings: Own, map: object) -> dict[str, Json]:
+        given.append(settings)
+        return {"radii_m": settings.radii_m}
+
+    own = Own((40.0, 17.3))
+    made = store.build(store.step(Stage("typed", 1, run), {}, own), serial_map)
+    assert given == [own]
+    assert made.facts == made.record["settings"] == {"radii_m": [40.0, 17.3]}
+
+
+def test_settings_that_can_change_are_a_defect(store: Store) -> None:
+    @dataclass
+    class Loose:
+        times: int = 1
+
+    for settings in ({"times": 1}, Loose(), toys.Words):
+        with pytest.raises(TypeError, match=r"settings of stage words: .* is no frozen dataclass"):
+            store.step(toys.WORDS, {}, settings)  # type: ignore[arg-type]
+
+
+def test_a_setting_at_its_default_may_stay_out_of_the_key() -> None:
+    @dataclass(frozen=True)
+    class Older:
+        level: int
+
+    @dataclass(frozen=True)
+    class Newer:
+        level: int
+        pixel_ratio: int = unstated(1)
+        style: int | None = unstated(None)
+        scale: float = 1.0
+
+    assert canonical(plain(Newer(3))) == '{"level":3,"scale":1.0}'
+    assert canonical(plain(Newer(3, 2, 0))) == '{"level":3,"pixel_ratio":2,"scale":1.0,"style":0}'
+    assert plain({"own": [Newer(3)]}) == {"own": [{"level": 3, "scale": 1.0}]}
+    assert plain(Older(3)) == {"level": 3}
 
 
 def test_failing_stage_leaves_nothing(store: Store) -> None:
-    step = store.step(toys.REFUSE, {}, {})
+    step = store.step(toys.REFUSE, {}, toys.Nothing())
     with pytest.raises(InputError, match="cut off at line 3"):
         store.build(step, serial_map)
     assert not step.path.exists()
@@ -313,7 +348,7 @@ def test_failing_stage_leaves_nothing(store: Store) -> None:
 
 
 def test_facts_that_are_no_json_are_a_defect(store: Store) -> None:
-    step = store.step(Stage("odd", 1, lambda i, o, s, m: {"rmse": math.nan}), {}, {})
+    step = store.step(Stage("odd", 1, lambda i, o, s, m: {"rmse": math.nan}), {}, toys.Nothing())
     with pytest.raises(TypeError, match=r"facts\.rmse"):
         store.build(step, serial_map)
     assert store.find(step) is None
@@ -325,7 +360,7 @@ def test_record_name_belongs_to_the_store(store: Store) -> None:
         return {}
 
     with pytest.raises(ValueError, match="belongs to the store"):
-        store.build(store.step(Stage("odd", 1, run), {}, {}), serial_map)
+        store.build(store.step(Stage("odd", 1, run), {}, toys.Nothing()), serial_map)
 
 
 @pytest.mark.parametrize("harm", ["truncate", "remove", "record"])
@@ -379,7 +414,7 @@ def test_kill_at_any_file_system_call(stride: int, tmp_path: Path) -> None:
         )
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr == ""
-    assert int(ran.stdout) >= 1000 // stride
+    assert int(ran.stdout) >= 600 // stride
 
 
 def test_litter_of_the_dead_goes_and_work_of_the_living_stays(store: Store) -> None:
@@ -424,44 +459,44 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_full_disk_is_one_line_and_leaves_nothing(small_disk: Path) -> None:
     store = Store(small_disk / "store")
-    step = store.step(toys.FILL, {}, {"chunks": 64})
+    step = store.step(toys.FILL, {}, toys.Fill(64))
     with pytest.raises(WorkflowError, match=r"stage fill: .*the disk is full") as error:
         store.build(step, serial_map)
     assert str(small_disk) in one_line(error)
     assert not step.path.exists()
     assert not list((store.root / "tmp").iterdir())
-    assert store.build(store.step(toys.FILL, {}, {"chunks": 8}), serial_map).fresh  # it works again
+    assert store.build(store.step(toys.FILL, {}, toys.Fill(8)), serial_map).fresh  # it works again
 
 
 def test_full_disk_as_gdal_and_sqlite_tell_it(small_disk: Path) -> None:
     def run(inputs: object, out: Path, settings: object, map: object) -> dict[str, int]:
         try:
-            toys.run_fill({}, out, {"chunks": 64}, serial_map)
+            toys.run_fill({}, out, toys.Fill(64), serial_map)
         except OSError:
             raise RuntimeError("CPLE_AppError: write error") from None
         return {}
 
     store = Store(small_disk / "store")
     with pytest.raises(WorkflowError, match="the disk is full") as error:
-        store.build(store.step(Stage("gdal", 1, run), {}, {}), serial_map)
+        store.build(store.step(Stage("gdal", 1, run), {}, toys.Nothing()), serial_map)
     one_line(error)
 
 
 def test_outputs_silently_cut_on_a_full_disk_are_refused(small_disk: Path) -> None:
     def run(inputs: object, out: Path, settings: object, map: object) -> dict[str, int]:
         with contextlib.suppress(OSError):  # GDAL's habit
-            toys.run_fill({}, out, {"chunks": 64}, serial_map)
+            toys.run_fill({}, out, toys.Fill(64), serial_map)
         return {}
 
     store = Store(small_disk / "store")
     with pytest.raises(WorkflowError, match="the disk is full"):
-        store.build(store.step(Stage("gdal", 1, run), {}, {}), serial_map)
+        store.build(store.step(Stage("gdal", 1, run), {}, toys.Nothing()), serial_map)
 
 
 def test_publishing_to_a_full_disk_keeps_the_old_result(small_disk: Path, tmp_path: Path) -> None:
     store = Store(tmp_path / "store")
-    small = store.build(store.step(toys.FILL, {}, {"chunks": 4}), serial_map)
-    large = store.build(store.step(toys.FILL, {}, {"chunks": 64}), serial_map)
+    small = store.build(store.step(toys.FILL, {}, toys.Fill(4)), serial_map)
+    large = store.build(store.step(toys.FILL, {}, toys.Fill(64)), serial_map)
     publish(small, small_disk / "out", ["big.bin"])
     with pytest.raises(WorkflowError, match="the disk is full") as error:
         publish(large, small_disk / "out", ["big.bin"])
@@ -473,7 +508,7 @@ def test_publishing_to_a_full_disk_keeps_the_old_result(small_disk: Path, tmp_pa
 def test_limit_on_the_size_of_files(store: Store) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    step = store.step(toys.FILL, {}, {"chunks": 64})
+    step = store.step(toys.FILL, {}, toys.Fill(64))
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, limits[1]))
         with pytest.raises(WorkflowError, match="larger than this system allows") as error:
@@ -488,7 +523,7 @@ def test_limit_on_the_size_of_files(store: Store) -> None:
 def test_read_only_store_is_one_line(small_disk: Path, source: Path) -> None:
     store = Store(small_disk / "store")
     made = words(store, source)
-    step = store.step(toys.WORDS, {"text": source}, {"times": 2})
+    step = store.step(toys.WORDS, {"text": source}, toys.Words(2))
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     for attempt in (
         lambda: store.build(step, serial_map),
@@ -562,15 +597,15 @@ def test_a_run_may_wait_for_the_region(store: Store) -> None:
 
 def test_two_regions_may_make_the_same_artifact(store: Store, source: Path) -> None:
     """The slower of two runs with the same key keeps the artifact of the faster."""
-    step = store.step(toys.WORDS, {"text": source}, {})
+    step = store.step(toys.WORDS, {"text": source}, toys.Words())
 
-    def run(inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], map: Map) -> dict[str, Json]:
+    def run(inputs: Mapping[str, Path], out: Path, settings: toys.Words, map: Map) -> dict[str, Json]:
         if not step.path.exists():
             Store(store.root).build(step, serial_map)
         return toys.run_words(inputs, out, settings, serial_map)
 
     slower = Stage("words", 1, run)
-    made = store.build(store.step(slower, {"text": source}, {}), serial_map)
+    made = store.build(store.step(slower, {"text": source}, toys.Words()), serial_map)
     assert made.path == step.path
     assert toys.CALLS == ["words", "words"]
     assert store.verify(made) == []

@@ -19,7 +19,8 @@ from typing import Any
 
 from workflow_toys import toy_plan
 
-from brmgeo.workflow.store import RECORD, publish
+from brmgeo.workflow.publish import publish
+from brmgeo.workflow.store import RECORD
 
 FILES = {"open", "close", "mkdir", "rename", "replace", "unlink", "rmdir", "flock"}
 BYTES = {"write", "pwrite", "flush", "fsync", "sendfile", "ioctl", "ftruncate"}

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import FlightError, InputError
 from brmgeo.workflow.plan import Plan
-from brmgeo.workflow.schedule import _look_around
-from brmgeo.workflow.stage import Json, Map, Stage
+from brmgeo.workflow.schedule import look_around
+from brmgeo.workflow.stage import Json, Map, Stage, unstated
 from brmgeo.workflow.store import Store
 
 CALLS: list[str] = []
@@ -57,7 +58,7 @@ def threads_of(x: int) -> str | None:
 
 def look_around_elsewhere(token: str) -> tuple[bool, str]:
     """As a worker on another machine answers, where the shared folder is not mounted."""
-    return _look_around(f"/another/machine/{token}")
+    return look_around(f"/another/machine/{token}")
 
 
 def die(x: int) -> int:
@@ -75,10 +76,30 @@ def die_once(item: tuple[int, str]) -> int:
     return x * x
 
 
-def run_words(inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], map: Map) -> dict[str, Json]:
+@dataclass(frozen=True, slots=True)
+class Nothing:
+    """Settings of a stage that has none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    times: int = unstated(1)
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    blocks: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fill:
+    chunks: int
+
+
+def run_words(inputs: Mapping[str, Path], out: Path, settings: Words, map: Map) -> dict[str, Json]:
     """Upper-cases a source file; a folder with a file more."""
     CALLS.append("words")
-    text = inputs["text"].read_text().upper() * settings.get("times", 1)
+    text = inputs["text"].read_text().upper() * settings.times
     (out / "words.txt").write_text(text)
     (out / "parts").mkdir()
     for index, word in enumerate(text.split()):
@@ -86,9 +107,7 @@ def run_words(inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], 
     return {"words": len(text.split())}
 
 
-def run_squares(
-    inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], map: Map
-) -> dict[str, Json]:
+def run_squares(inputs: Mapping[str, Path], out: Path, settings: Nothing, map: Map) -> dict[str, Json]:
     CALLS.append("squares")
     length = len((inputs["words"] / "words.txt").read_text())
     squares = list(map(square, range(length)))
@@ -96,21 +115,21 @@ def run_squares(
     return {"sum": sum(squares)}
 
 
-def run_noise(inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], map: Map) -> dict[str, Json]:
+def run_noise(inputs: Mapping[str, Path], out: Path, settings: Noise, map: Map) -> dict[str, Json]:
     CALLS.append("noise")
-    blocks = list(map(noise_block, range(settings["blocks"])))
+    blocks = list(map(noise_block, range(settings.blocks)))
     np.stack(blocks).tofile(out / "noise.bin")
     return {"mean": float(np.mean(blocks))}
 
 
-def run_fill(inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], map: Map) -> dict[str, Json]:
+def run_fill(inputs: Mapping[str, Path], out: Path, settings: Fill, map: Map) -> dict[str, Json]:
     with open(out / "big.bin", "wb") as handle:
-        for _ in range(settings["chunks"]):
+        for _ in range(settings.chunks):
             handle.write(b"x" * 65536)
     return {}
 
 
-def run_refuse(inputs: Mapping[str, Path], out: Path, settings: dict[str, Json], map: Map) -> dict[str, Json]:
+def run_refuse(inputs: Mapping[str, Path], out: Path, settings: Nothing, map: Map) -> dict[str, Json]:
     (out / "half.txt").write_text("half")
     raise InputError("sheet 1.dxf: cut off at line 3; fetch it again")
 
@@ -122,9 +141,9 @@ FILL = Stage("fill", 1, run_fill)
 REFUSE = Stage("refuse", 1, run_refuse)
 
 
-def toy_plan(root: Path, source: Path, **settings: object) -> Plan:
+def toy_plan(root: Path, source: Path, times: int = 1) -> Plan:
     """Two steps, the second of which eats the first."""
     plan = Plan(Store(root), "toy")
-    words = plan.add(WORDS, {"text": source}, settings)
-    plan.add(SQUARES, {"words": words}, {})
+    words = plan.add(WORDS, {"text": source}, Words(times))
+    plan.add(SQUARES, {"words": words}, Nothing())
     return plan

@@ -1,0 +1,76 @@
+"""Results under stable names: copies of what the store holds, each whole or as it was before."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from brmgeo import files
+from brmgeo.workflow.disk import disk_errors
+from brmgeo.workflow.stage import Json
+from brmgeo.workflow.store import Artifact
+
+PUBLISHED = ".brmgeo-published.json"
+
+
+def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | Iterable[str]) -> list[str]:
+    """Copies outputs (files, or folders with all in them) to ``out_dir`` under stable names; the names that were written.
+
+    ``names`` maps names in the artifact to names in ``out_dir``, or lists names that stay the same. Each file
+    is replaced at once, never half written, and only when it is not the one published before: files that an earlier
+    artifact put into a published folder and this one lacks are removed. The copies are no links, since programs like
+    QGIS write into the files that they open. Raises WorkflowError when ``out_dir`` cannot be written,
+    KeyError when the artifact has no such output.
+    """
+    out = Path(out_dir).absolute()
+    wanted: dict[str, tuple[str, Json]] = {}
+    roots = []
+    outputs = artifact.record["outputs"]
+    for name, target in (names if isinstance(names, Mapping) else {n: n for n in names}).items():
+        inside = {n: target + n[len(name) :] for n in outputs if n == name or n.startswith(f"{name}/")}
+        if not inside and not (artifact.path / name).is_dir():
+            raise KeyError(
+                f"stage {artifact.step.label} has no output {name}; it has {', '.join(sorted(outputs))}"
+            )
+        roots.append(target)
+        wanted |= {goal: (source, outputs[source]) for source, goal in inside.items()}
+    written = []
+    with disk_errors(f"results in {out}", out):
+        out.mkdir(parents=True, exist_ok=True)
+        for litter in out.glob(f"{files.SCRATCH}*"):
+            litter.unlink(missing_ok=True)
+        known = files.read_json(out / PUBLISHED)
+        known = known if isinstance(known, dict) else {}
+        before = dict(known)
+        try:
+            for goal, (source, entry) in sorted(wanted.items()):
+                if goal in known and known[goal] == [entry["sha256"], *_look(out / goal)]:
+                    continue
+                part = out / f"{files.SCRATCH}{uuid.uuid4().hex}"
+                try:
+                    files.copy(artifact.path / source, part)
+                    (out / goal).parent.mkdir(parents=True, exist_ok=True)
+                    os.replace(part, out / goal)
+                finally:
+                    part.unlink(missing_ok=True)
+                known[goal] = [entry["sha256"], *_look(out / goal)]
+                written.append(goal)
+            for goal in [g for g in known if g not in wanted and any(g.startswith(f"{r}/") for r in roots)]:
+                (out / goal).unlink(missing_ok=True)
+                del known[goal]
+        finally:
+            if known != before:
+                files.write_json(out / PUBLISHED, known, durable=True)
+        files.sync(out)
+    return written
+
+
+def _look(path: Path) -> tuple[int, ...]:
+    """Size and time of a published file, (-1, -1) when absent: copies of the results keep them, unlike inodes."""
+    try:
+        s = path.stat()
+    except FileNotFoundError:
+        return (-1, -1)
+    return (s.st_size, s.st_mtime_ns)
