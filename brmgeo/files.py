@@ -67,8 +67,7 @@ def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield scratch
         if durable:
-            with open(scratch, "rb+") as handle:
-                os.fsync(handle.fileno())
+            sync(scratch)
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -196,10 +196,11 @@ class GenerateSettings(_Settings):
     season: Literal["spring", "summer", "autumn", "winter"] | None = None
 
 
-class Region(_Settings):
-    """One region. ``bounds`` are (left, bottom, right, top) metres in ``crs``; ``sheets`` NGII sheet numbers.
+class MapSettings(_Settings):
+    """What maps are made of. ``bounds`` are (left, bottom, right, top) metres in ``crs``; ``sheets`` NGII sheet numbers.
 
-    At least one of the two is given. With both, the lattice covers ``bounds`` and the map is known where the sheets lie.
+    With both, the lattice covers ``bounds`` and the map is known where the sheets lie; with neither, the footprints say
+    where the maps are.
     """
 
     name: Name
@@ -211,8 +212,6 @@ class Region(_Settings):
     footprints: FootprintsSettings = FootprintsSettings()
     imagery: ImagerySettings | None = None
     ratio: RatioSettings = RatioSettings(n=3, agl_m=150.0, fov_deg=43.0)
-    flight: FlightSettings = FlightSettings()
-    training: TrainingSettings = TrainingSettings()
     generate: GenerateSettings | None = None
 
     @field_validator("sheets")
@@ -233,15 +232,26 @@ class Region(_Settings):
         return value
 
     @model_validator(mode="after")
-    def _placed(self) -> Region:
-        if self.bounds is None and not self.sheets:
-            raise ValueError("give 'bounds' or 'sheets': the region has no place")
+    def _spans_ground(self) -> Self:
         if self.bounds is not None:
             left, bottom, right, top = self.bounds
             if not (left < right and bottom < top):
                 raise ValueError(
                     "'bounds' must be [left, bottom, right, top] with left < right and bottom < top"
                 )
+        return self
+
+
+class Region(MapSettings):
+    """One region: its maps, at a stated place, how it is flown over, and how training tiles are cut from it."""
+
+    flight: FlightSettings = FlightSettings()
+    training: TrainingSettings = TrainingSettings()
+
+    @model_validator(mode="after")
+    def _placed(self) -> Self:
+        if self.bounds is None and not self.sheets:
+            raise ValueError("give 'bounds' or 'sheets': the region has no place")
         return self
 
 

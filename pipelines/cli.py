@@ -159,7 +159,7 @@ def maps(
             raise SettingsError(
                 "maps --footprints: give --crs (such as EPSG:5187) and --out (a folder for the results)"
             )
-        spec = job.region_of_files(
+        spec = job.maps_of_files(
             out,
             footprints,
             crs=crs,

@@ -8,7 +8,7 @@ from pathlib import Path
 from brmgeo.errors import SettingsError
 from brmgeo.geo.crs import require_projected_metres
 from brmgeo.geo.sheets import is_sheet_number
-from brmgeo.region import Region
+from brmgeo.region import MapSettings
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.store import Input, Step, Store
 from pipelines.map_sources import (
@@ -41,7 +41,7 @@ from pipelines.map_stages import (
 MAX_RADIUS_PX = 5_000  # a block's halo, and with it memory, grows with the radius
 
 
-def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = False) -> Plan:
+def plan_maps(region: MapSettings, store: Store, source_dir: Path, fetch: bool = False) -> Plan:
     """The steps of a region's maps; with ``fetch`` the tiles of a service that the user named are fetched for it.
 
     Raises MissingInputError (which files or tiles, where they go, where to get them).
@@ -77,7 +77,7 @@ def plan_maps(region: Region, store: Store, source_dir: Path, fetch: bool = Fals
     return plan
 
 
-def _require_sound(region: Region) -> None:
+def _require_sound(region: MapSettings) -> None:
     """Raises CrsError or SettingsError for what a region file cannot be seen to be wrong in by itself."""
     require_projected_metres(region.crs)
     for number in region.sheets:
@@ -94,7 +94,7 @@ def _require_sound(region: Region) -> None:
 
 
 def imagery_of(
-    region: Region, store: Store, source_dir: Path, fetch: bool = False
+    region: MapSettings, store: Store, source_dir: Path, fetch: bool = False
 ) -> tuple[dict[str, Input], ImageryFiles]:
     """What a region's imagery is made from: its local files or, where it is generated, the step that makes them.
 
@@ -107,7 +107,7 @@ def imagery_of(
     return {"imagery": made}, ImageryFiles.of(region.imagery, "tiles")
 
 
-def _source_settings(region: Region) -> SourceSettings:
+def _source_settings(region: MapSettings) -> SourceSettings:
     assert region.generate is not None
     if not region.sheets:
         raise SettingsError(
@@ -124,12 +124,12 @@ def _source_settings(region: Region) -> SourceSettings:
     )
 
 
-def _generated_files(region: Region, source: Step[SourceSettings]) -> list[SourceFile]:
+def _generated_files(region: MapSettings, source: Step[SourceSettings]) -> list[SourceFile]:
     return [SourceFile({"file": source}, f"sheets/{s}.dxf", f"{s}.dxf", s) for s in region.sheets]
 
 
 def _add_outlines(
-    plan: Plan, region: Region, files: Sequence[SourceFile]
+    plan: Plan, region: MapSettings, files: Sequence[SourceFile]
 ) -> dict[str, Step[OutlinesSettings]]:
     """One step a file, by sheet or, where another has that, by the file's name."""
     own = region.footprints
@@ -154,7 +154,9 @@ def _add_outlines(
     return steps
 
 
-def _add_imagery(plan: Plan, region: Region, source_dir: Path, fetch: bool) -> Step[MosaicSettings] | None:
+def _add_imagery(
+    plan: Plan, region: MapSettings, source_dir: Path, fetch: bool
+) -> Step[MosaicSettings] | None:
     given = region.imagery
     if given is None:
         return None

@@ -19,7 +19,7 @@ from brmgeo.files import digest_of
 from brmgeo.geo.grid import Bounds, as_bounds, bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import grid_named
-from brmgeo.region import ImagerySettings, Region
+from brmgeo.region import ImagerySettings, MapSettings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.stage import unstated
 from brmgeo.workflow.store import Input
@@ -46,7 +46,7 @@ class SourceFile:
     sheet: str | None
 
 
-def find_sources(region: Region, source_dir: Path) -> list[SourceFile]:
+def find_sources(region: MapSettings, source_dir: Path) -> list[SourceFile]:
     """The files that a region's footprint paths name; raises MissingInputError for sheets without a file."""
     own = region.footprints
     found: dict[Path, None] = {}
@@ -104,7 +104,7 @@ def _parts_of(path: Path) -> dict[str, Input]:
     return parts
 
 
-def _number_of(path: Path, region: Region) -> str | None:
+def _number_of(path: Path, region: MapSettings) -> str | None:
     """The sheet that a file's name (or, of NGII's shapefiles, its folder's) states: the region's, else any it could be."""
     for name in (path.name, path.parent.name):
         for number in sorted(region.sheets, key=len, reverse=True):
@@ -199,7 +199,7 @@ def _is_placed(path: Path) -> bool:
 
 
 def imagery_inputs(
-    region: Region, given: ImagerySettings, source_dir: Path, fetch: bool
+    region: MapSettings, given: ImagerySettings, source_dir: Path, fetch: bool
 ) -> tuple[dict[str, Input], ImageryFiles]:
     """The local files of an imagery source, by name, and what the stage must know of them; with ``fetch`` those of a service
     are fetched first.
@@ -234,7 +234,7 @@ def imagery_inputs(
     return {"imagery": path}, ImageryFiles.of(given)
 
 
-def _tile_range(region: Region, given: ImagerySettings) -> str:
+def _tile_range(region: MapSettings, given: ImagerySettings) -> str:
     if given.kind != "tiles" or given.level is None:
         return ""
     tiles = grid_named(given.grid).covering(place_of(region), region.crs, given.level)
@@ -242,7 +242,7 @@ def _tile_range(region: Region, given: ImagerySettings) -> str:
     return f": {len(tiles)} tiles, x {min(xs)}-{max(xs)}, y {min(ys)}-{max(ys)}"
 
 
-def _service_tiles(region: Region, given: ImagerySettings, source_dir: Path, fetch: bool) -> Path:
+def _service_tiles(region: MapSettings, given: ImagerySettings, source_dir: Path, fetch: bool) -> Path:
     """The folder in which the tiles of a service are kept, filled when asked for."""
     from brmgeo.ingest.tiles import TileService, ensure_tiles
 
@@ -277,7 +277,7 @@ def _service_tiles(region: Region, given: ImagerySettings, source_dir: Path, fet
     return cache
 
 
-def _rasters(region: Region, path: Path) -> list[Path]:
+def _rasters(region: MapSettings, path: Path) -> list[Path]:
     """The images that a path, pattern or folder names; all in one folder."""
     if path.is_file():
         return [path]
@@ -319,7 +319,7 @@ class NativeImagery:
         return mosaic_to_lattice(imagery_sources(self.source, self.root), box)[0], left, top
 
 
-def finer_imagery(region: Region, source: ImageryFiles, root: Path) -> NativeImagery | None:
+def finer_imagery(region: MapSettings, source: ImageryFiles, root: Path) -> NativeImagery | None:
     """The imagery of a region where it is finer than the region's lattice, by a whole number of steps; else None."""
     from brmgeo.ingest.imagery import native_gsd_m
 
@@ -332,17 +332,17 @@ def finer_imagery(region: Region, source: ImageryFiles, root: Path) -> NativeIma
 # --- both -----------------------------------------------------------------------------------------------------
 
 
-def place_of(region: Region) -> Bounds:
+def place_of(region: MapSettings) -> Bounds:
     """(left, bottom, right, top) that a region covers: its bounds, else those of its sheets."""
     return as_bounds(region.bounds) if region.bounds is not None else _sheets_bounds(region)
 
 
-def _sheets_bounds(region: Region) -> Bounds:
+def _sheets_bounds(region: MapSettings) -> Bounds:
     extents = np.array([sheet_extent(s, region.crs) for s in region.sheets])
     return as_bounds([*extents[:, :2].min(axis=0), *extents[:, 2:].max(axis=0)])
 
 
-def credits(region: Region) -> str:
+def credits(region: MapSettings) -> str:
     """Whose the footprints and the imagery of a region are, each said once."""
     parts = [region.footprints.attribution, region.imagery.attribution if region.imagery else ""]
     return "; ".join(dict.fromkeys(p for p in parts if p))

@@ -13,7 +13,7 @@ from typing import Any
 
 from brmgeo import files
 from brmgeo.errors import MissingInputError
-from brmgeo.region import Region
+from brmgeo.region import MapSettings
 from brmgeo.settings import checked
 from brmgeo.workflow.plan import StepStatus
 from brmgeo.workflow.progress import Progress
@@ -44,7 +44,7 @@ def build_region(name: str, data: Path, out: Path | None, repairs: bool, schedul
 
 
 def build_maps(
-    region: Region, store_dir: Path, out: Path, source_dir: Path, scheduler_spec: str | None
+    region: MapSettings, store_dir: Path, out: Path, source_dir: Path, scheduler_spec: str | None
 ) -> Path:
     """Builds what is missing of a region's maps in the store and publishes everything in ``out``."""
     progress = Progress()
@@ -73,7 +73,7 @@ def _source_names(source: Artifact) -> list[str]:
     return sorted({name.split("/")[0] for name in source.record["outputs"]})
 
 
-def _write_facts(region: Region, made: Mapping[str, Artifact], path: Path) -> None:
+def _write_facts(region: MapSettings, made: Mapping[str, Artifact], path: Path) -> None:
     """maps.json: the facts of every stage, from their records, so that a run with nothing to do changes nothing."""
     facts = {
         "region": region.name,
@@ -95,7 +95,7 @@ def _write_facts(region: Region, made: Mapping[str, Artifact], path: Path) -> No
         files.write_json(path, facts)
 
 
-def region_of_files(
+def maps_of_files(
     out: Path,
     footprints: Sequence[Path],
     *,
@@ -109,8 +109,11 @@ def region_of_files(
     encoding: str | None = None,
     source_crs: str | None = None,
     repairs: bool = False,
-) -> Region:
-    """A region without a region file, for ``brmgeo maps --footprints``; raises MissingInputError for absent files."""
+) -> MapSettings:
+    """Maps without a region file, for ``brmgeo maps --footprints``; raises MissingInputError for absent files.
+
+    A region file must say where the region is; here the footprints may.
+    """
     for path in (*footprints, *([imagery] if imagery else [])):
         if not path.exists():
             raise MissingInputError(f"maps --footprints: {path} is not there; correct the path")
@@ -136,12 +139,7 @@ def region_of_files(
         asked["gsd_m"] = gsd_m
     if radii_m is not None:
         asked["ratio"] = {"radii_m": tuple(radii_m)}
-    # A region file must say where the region is; here the footprints may.
-    placeless = bounds is None and not numbers
-    if placeless:
-        asked["bounds"] = (0.0, 0.0, 1.0, 1.0)
-    region = checked(Region, asked, "maps --footprints")
-    return region.model_copy(update={"bounds": None}) if placeless else region
+    return checked(MapSettings, asked, "maps --footprints")
 
 
 def _files_of(path: Path) -> list[Path]:
@@ -166,7 +164,7 @@ def missing_sources(name: str, data: Path) -> list[str]:
     return []
 
 
-def native_imagery(region: Region, data: Path) -> NativeImagery | None:
+def native_imagery(region: MapSettings, data: Path) -> NativeImagery | None:
     """The imagery that a built region was made from, where that is finer than its lattice; else None."""
     if region.imagery is None:
         return None

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from brmgeo import files
-from brmgeo.errors import SettingsError
+from brmgeo.errors import SettingsError, WorkflowError
 
 
 def test_a_file_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_folders_have_the_mode_that_the_umask_asks_for(tmp_path: Path) -> None:
     code = f"""
 import os, pathlib
 from brmgeo import files
-from brmgeo.errors import SettingsError
+from brmgeo.errors import SettingsError, WorkflowError
 os.umask(0o077)
 with files.whole_folder(pathlib.Path({str(tmp_path / "out")!r})) as scratch:
     files.write_text(scratch / "a", "x")
@@ -141,7 +141,7 @@ def test_a_lock_is_held_against_another_process(tmp_path: Path) -> None:
     code = f"""
 import pathlib
 from brmgeo import files
-from brmgeo.errors import SettingsError
+from brmgeo.errors import SettingsError, WorkflowError
 d = files.open_lock(pathlib.Path({str(path)!r}))
 print(files.take_lock(d, wait=False))
 """
@@ -150,3 +150,26 @@ print(files.take_lock(d, wait=False))
     assert subprocess.run(run, capture_output=True, text=True, cwd=root).stdout.strip() == "False"
     os.close(held)
     assert subprocess.run(run, capture_output=True, text=True, cwd=root).stdout.strip() == "True"
+
+
+def test_files_below_a_folder_are_named_from_it(tmp_path: Path) -> None:
+    for name in ("b.txt", "a/c.txt", "a/.d/e.txt", ".f.txt"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    assert sorted(files.files_below(tmp_path)) == [".f.txt", "a/.d/e.txt", "a/c.txt", "b.txt"]
+    assert sorted(files.files_below(tmp_path, hidden=False)) == ["a/c.txt", "b.txt"]
+    assert files.folders_below(tmp_path) == [tmp_path / "a" / ".d", tmp_path / "a"]
+    for path in (tmp_path, tmp_path / "b.txt"):
+        files.sync(path)
+    with pytest.raises(FileNotFoundError):
+        files.sync(tmp_path / "no.txt")
+
+
+def test_a_place_that_cannot_be_written_is_told_before_any_work(tmp_path: Path) -> None:
+    files.require_writable(tmp_path / "new" / "folder")
+    assert not list((tmp_path / "new" / "folder").iterdir())
+    (tmp_path / "file").touch()
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(WorkflowError, match=r"a file stands there\); choose another place"):
+            files.require_writable(place)

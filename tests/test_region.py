@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from brmgeo.errors import MissingInputError, SettingsError
-from brmgeo.region import Region, load_region
+from brmgeo.region import MapSettings, Region, load_region
+from brmgeo.settings import checked
 
 GOOD = """
 name = "town"
@@ -97,3 +98,13 @@ def test_embedded_regions_load() -> None:
         load_region(p) for p in sorted(folder.glob("*.toml")) if not p.stem.startswith("_")
     ]
     assert {"demo", "daegwallyeong"} <= {r.name for r in regions}
+
+
+def test_a_region_has_a_place_where_maps_alone_may_leave_it_to_the_footprints() -> None:
+    asked = {"name": "town", "crs": "EPSG:5187"}
+    assert checked(MapSettings, asked, "maps").bounds is None
+    with pytest.raises(SettingsError, match=r"^region: give 'bounds' or 'sheets'"):
+        checked(Region, asked, "region")
+    for kind in (MapSettings, Region):
+        with pytest.raises(SettingsError, match="left < right and bottom < top"):
+            checked(kind, asked | {"bounds": (9.0, 9.0, 1.0, 1.0)}, "maps")

@@ -39,8 +39,7 @@ def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | 
     written = []
     with disk_errors(f"results in {out}", out):
         out.mkdir(parents=True, exist_ok=True)
-        for litter in out.glob(f"{files.SCRATCH}*"):
-            litter.unlink(missing_ok=True)
+        files.clear_scratch(out, older_than_s=0.0)
         known = files.read_json(out / PUBLISHED)
         known = known if isinstance(known, dict) else {}
         before = dict(known)
