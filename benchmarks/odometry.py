@@ -323,7 +323,7 @@ def score(result: VioResult, truth: Any, yaw: Any, seconds: float) -> dict[str, 
 
 def read_demo() -> tuple[Imagery, Any]:
     from brmgeo.geo.raster import read_raster
-    from pipelines.flights import read_ground
+    from brmgeo.synth.mission import read_ground
 
     folder = ROOT / "data" / "out" / "demo"
     if not (folder / "imagery.tif").is_file():

@@ -470,7 +470,8 @@ def simulate(
     settings_file: Path | None,
 ) -> None:
     """Simulate a flight over REGION: frames or masks, odometry and reference in one folder; an IMU with frames."""
-    from pipelines import flights as job
+    from pipelines import simulate as job
+    from pipelines.built import maps_for
     from pipelines.maps import native_imagery
 
     if out is None and region is None:
@@ -481,18 +482,25 @@ def simulate(
         )
     if season is not None and (region is None or mode == "masks"):
         raise SettingsError("simulate --season: needs a generated REGION, and --mode frames or both")
-    own, folder, _ = job.maps_for("simulate", region, maps_dir, data, scheduler)
+    built = maps_for("simulate", region, maps_dir, data, scheduler)
     what = job.Simulation(
-        folder.absolute(), own.flight, path, mode, scale_bias, no_odometry=no_odometry, compass=compass,
-        interval_s=interval_s, settings_file=None if settings_file is None else settings_file.absolute(),
-    )  # fmt: skip
-    flights = data / "source" / own.name / "flights"
+        maps_dir=built.folder.absolute(),
+        own=built.flight,
+        path=path,
+        mode=mode,  # type: ignore[arg-type]
+        scale_bias=scale_bias,
+        no_odometry=no_odometry,
+        compass=compass,
+        interval_s=interval_s,
+        settings_file=None if settings_file is None else settings_file.absolute(),
+    )
+    flights = data / "source" / built.name / "flights"
     with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
-        if season is not None:
-            picture = job.other_day(own, folder, season, seed, Path(scratch) / "other-day.tif")
-            what = replace(what, imagery=picture)
-        elif region is not None and mode != "masks":
-            what = replace(what, native=native_imagery(own, data))
+        if season is not None and built.region is not None:
+            file = Path(scratch) / "other-day.tif"
+            what = replace(what, imagery=job.other_day(built.region, built.folder, season, seed, file))
+        elif built.region is not None and mode != "masks":
+            what = replace(what, native=native_imagery(built.region, data))
         if count is None:
             name = name or f"simulated-{seed}"
             click.echo(f"wrote {job.simulate_flight(what, seed, out or flights / name, name)}")
@@ -586,17 +594,19 @@ def localize(
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
     from brmgeo.locate.masks import NetworkUse
     from pipelines import flights as job
+    from pipelines.built import maps_for
     from pipelines.regions import note_flown
+    from pipelines.simulate import default_flight
 
-    own, folder, attribution = job.maps_for("localize", region, maps_dir, data, scheduler)
+    built = maps_for("localize", region, maps_dir, data, scheduler)
     if flight is None:
-        if region is None:
+        if built.region is None:
             raise SettingsError("localize --maps: give --flight, the folder of the flight")
-        flight = job.default_flight(own, folder, data, seed)
+        flight = default_flight(built.region, built.folder, data, seed)
     if out is None:
         if region is None:
             raise SettingsError("localize --maps: give --out, the folder for the results")
-        out = data / "out" / own.name / "flights" / job.flight_name(flight) / method
+        out = data / "out" / built.name / "flights" / job.flight_name(flight) / method
     cache = data / "work" / "masks" if region is not None else out.absolute().parent / ".brmgeo-masks"
     own_use = NetworkUse()
     use = NetworkUse(
@@ -608,20 +618,20 @@ def localize(
         looks=looks,
     )
     job.localize(
-        folder,
+        built.folder,
         flight,
         method,
         out,
-        flight_settings=own.flight,
+        flight_settings=built.flight,
         compass=compass,
         sift=sift,
         max_speed_m_s=max_speed_m_s,
         odometry=odometry,
         network=use,
-        attribution=attribution,
+        attribution=built.attribution,
     )
     if region is not None:
-        note_flown(own.name, data, out)
+        note_flown(built.name, data, out)
 
 
 @cli.command()
@@ -695,23 +705,27 @@ def evaluate(
     out: Path | None,
 ) -> None:
     """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
-    from pipelines import flights as job
+    from brmgeo.evaluate.trials import Drawn, MaskComparison, Trial
+    from brmgeo.synth.mission import PATHS
+    from pipelines import evaluate as job
+    from pipelines.built import maps_for
     from pipelines.maps import native_imagery
     from pipelines.regions import note_flown
+    from pipelines.simulate import other_day
 
     if results:
         click.echo(job.compare_results(results, out))
         return
-    own, folder, _ = job.maps_for("evaluate", region, maps_dir, data, scheduler)
+    built = maps_for("evaluate", region, maps_dir, data, scheduler)
     if out is None:
         if region is None:
             raise SettingsError("evaluate --maps: give --out, the folder for the table")
         out = (
             data
             / "out"
-            / own.name
+            / built.name
             / "evaluation"
-            / (f"hidden-{hide}" if hide else path if path in job.PATHS else "waypoints")
+            / (f"hidden-{hide}" if hide else path if path in PATHS else "waypoints")
         )
         # What is flown otherwise goes beside the plain table, not over it.
         kind = "".join(f"-{w}" for w in ("masks" if masks else "", "sift" if sift else "", season or "") if w)
@@ -723,24 +737,32 @@ def evaluate(
         raise SettingsError(
             "evaluate: --weights and --looks are of the network's masks: give --masks network too"
         )
-    compared = job.MaskComparison(kinds, weights, looks) if kinds else None
+    compared = MaskComparison(kinds, weights, looks) if kinds else None
     if season is not None and (region is None or not (sift or "network" in kinds)):
         raise SettingsError("evaluate --season: needs a generated REGION, and --sift or --masks network")
     with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
-        drawn = job.Drawn()
-        if season is not None:
-            file = job.other_day(own, folder, season, first_seed, Path(scratch) / "other-day.tif")
-            drawn = job.Drawn(imagery=file, season=season)
-        elif region is not None and (kinds or sift):
-            drawn = job.Drawn(native=native_imagery(own, data))
-        click.echo(
-            job.evaluate(
-                folder, own.flight, flights, first_seed, chosen, path, scale_bias, hide, out, scheduler,
-                compared, sift, drawn,
-            )
-        )  # fmt: skip
+        drawn = Drawn()
+        if season is not None and built.region is not None:
+            file = Path(scratch) / "other-day.tif"
+            other_day(built.region, built.folder, season, first_seed, file)
+            drawn = Drawn(imagery=file, season=season)
+        elif built.region is not None and (kinds or sift):
+            drawn = Drawn(native=native_imagery(built.region, data))
+        first = Trial(
+            maps_dir=built.folder.absolute(),
+            own=built.flight,
+            seed=first_seed,
+            methods=chosen,
+            path=path,
+            scale_bias=scale_bias,
+            hide=hide,  # type: ignore[arg-type]
+            masks=compared,
+            sift=sift,
+            drawn=drawn,
+        )
+        click.echo(job.evaluate(job.Evaluation(first, flights, out, scheduler)))
     if region is not None:
-        note_flown(own.name, data, out)
+        note_flown(built.name, data, out)
 
 
 @cli.command()

@@ -71,7 +71,7 @@ MAY_KNOW = {
     "brmgeo.flight": VALUES | {"brmgeo.maps.ratio"},
     "brmgeo.ingest": VALUES,
     "brmgeo.export": VALUES,
-    "brmgeo.evaluate": VALUES,
+    "brmgeo.evaluate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.locate", "brmgeo.synth"},
     "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
     "brmgeo.segment": VALUES | {"brmgeo.maps"},
     "brmgeo.locate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.segment"},

@@ -6,12 +6,24 @@ Frames and imagery are matched as pictures: SIFT, Lowe's ratio test, a similarit
 
 from __future__ import annotations
 
+import functools
 import math
+import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from brmgeo.evaluate.report import ReportTable
+from brmgeo.evaluate.scores import FALSE_FIX_M
+from brmgeo.flight.folder import Flight
+from brmgeo.flight.values import View
+from brmgeo.flight.view import make_view
+from brmgeo.geo.raster import read_overview
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,3 +106,70 @@ def _features(image: NDArray[np.uint8], count: int) -> tuple[NDArray[np.float32]
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
     # OpenCV puts pixel centres on whole numbers; ours lie at +0.5.
     return np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5), descriptors
+
+
+@functools.lru_cache(maxsize=1)
+def _sift_matcher(imagery: Path, changed_ns: int) -> tuple[SiftMatcher, float]:
+    """Features of a region's imagery, and its metres per pixel."""
+    # The time of the last change is in the key, so that imagery made anew is read anew.
+    pixels, bounds = read_overview(imagery, 4000)
+    gsd_m = (bounds[2] - bounds[0]) / pixels.shape[2]
+    return SiftMatcher(np.moveaxis(pixels, 0, -1), bounds[0], bounds[3], gsd_m), gsd_m
+
+
+def sift_fixes(
+    imagery: Path, pictures: Iterable[NDArray[np.uint8]], level: Callable[[int, NDArray[Any], float], View]
+) -> Iterator[tuple[SiftFix | None, float]]:
+    """The paper's Fig. 1: where SIFT finds each frame (h, w, 3) in a region's imagery, None where nowhere; and the seconds
+    that finding it took, of the levelled frame as the matchers' are.
+
+    ``level(index, grey, gsd_m)`` makes a view of a frame's (h, w) float32 grey levels in [0, 1].
+    """
+    matcher, gsd_m = _sift_matcher(imagery, imagery.stat().st_mtime_ns)
+    for index, picture in enumerate(pictures):
+        view = level(index, picture.astype(np.float32).mean(axis=2) / 255.0, gsd_m)
+        began = time.perf_counter()
+        fix = matcher.locate((view.building * 255).astype(np.uint8), gsd_m, view.nadir_px)
+        yield fix, time.perf_counter() - began
+
+
+def sift_table(
+    imagery: Path, flight: Flight, truth: NDArray[np.float64] | None, note: str = ""
+) -> ReportTable:
+    """The paper's Fig. 1 as a table: SIFT features of each frame against the region's imagery.
+
+    Args:
+        imagery: a raster in the map's CRS.
+        flight: with frames.
+        truth: (n, 2) where each frame was taken, metres in the map's CRS; None where nobody knows.
+        note: what is to be said below the table.
+    """
+
+    def level(index: int, grey: NDArray[Any], gsd_m: float) -> View:
+        f = flight.frames[index]
+        return make_view(
+            grey, flight.camera, flight.mount, f.roll_rad, f.pitch_rad, f.agl_m, gsd_m, t_s=f.t_s
+        )
+
+    found = right = 0
+    pictures = (flight.image(index) for index in range(len(flight.frames)))
+    for index, (fix, _) in enumerate(sift_fixes(imagery, pictures, level)):
+        if fix is not None:
+            found += 1
+            if truth is not None and np.linalg.norm(fix.xy - truth[index]) <= FALSE_FIX_M:
+                right += 1
+    total = len(flight.frames)
+    return ReportTable(
+        "SIFT against the imagery (the paper's Fig. 1)",
+        ("", "frames", "share"),
+        (
+            ("frames", str(total), ""),
+            ("with a match that RANSAC accepts", str(found), f"{found / total:.0%}"),
+            (
+                "of these within 50 m of the reference",
+                str(right) if truth is not None else "–",
+                f"{right / total:.0%}",
+            ),
+        ),
+        note,
+    )

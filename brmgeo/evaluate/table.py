@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
+from brmgeo.errors import InputError
 from brmgeo.evaluate.scores import Scores
 
 EARLY_M = 450.0
+#: Figures that metrics.json of earlier versions lack: their results still compare.
+_LATER = {"within_sigma", "share_smoothed"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +79,28 @@ class MethodSummary:
     converged_share: float
     seconds_per_frame: float
     first_frame_s: float | None
+
+
+def read_row(path: Path) -> FlightRow:
+    """The row of one located flight, from its metrics.json; InputError for a file that is none."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        within = values["within_sigma"]
+        fields = {n: values[n] for n in Scores.__dataclass_fields__ if n not in _LATER}
+        fields["share_smoothed"] = values.get("share_smoothed")
+        scores = Scores(**fields, within_sigma=None if within is None else (within[0], within[1], within[2]))
+        return FlightRow(
+            flight=values["flight"],
+            seed=0,
+            method=values["method"],
+            scores=scores,
+            seconds_per_frame=values["seconds_per_frame"],
+            first_frame_s=values.get("first_frame_s", math.nan),
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path} is not a metrics.json of brmgeo localize ({error!r}); run localize again"
+        ) from None
 
 
 def summarize(rows: Sequence[FlightRow]) -> list[MethodSummary]:

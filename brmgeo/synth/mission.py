@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import MissingInputError
 from brmgeo.flight.readings import Camera, FloatArray
-from brmgeo.geo.grid import Bounds, bounds_of, gsd_of
-from brmgeo.geo.raster import box_of, read_window
+from brmgeo.geo.grid import Bounds
+from brmgeo.geo.raster import read_raster
 from brmgeo.pictures import decode, encode
 from brmgeo.region import FlightSettings as RegionFlight
 from brmgeo.synth.flight import (
@@ -105,9 +105,8 @@ def imagery_along(
         reach = settings.agl_m * math.tan(math.radians(_seen_deg(settings)) / 2) * 2.5 + 60.0
         (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
         return Imagery(*fine.around((left, bottom, right, top)), fine.gsd_m)
-    box = box_of(file)
-    left, _, _, top = bounds_of(box)
-    return Imagery(np.moveaxis(read_window(file), 0, -1), left, top, gsd_of(box))
+    picture = read_raster(file)
+    return Imagery(np.moveaxis(picture.pixels, 0, -1), picture.left, picture.top, picture.gsd_m)
 
 
 def _seen_deg(settings: FlightSettings) -> float:

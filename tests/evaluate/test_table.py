@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import pytest
 
+from brmgeo.errors import InputError
+from brmgeo.evaluate.report import metrics_json
 from brmgeo.evaluate.scores import Scores
-from brmgeo.evaluate.table import FlightRow, markdown, plain, rows_csv, summarize
+from brmgeo.evaluate.table import FlightRow, markdown, plain, read_row, rows_csv, summarize
 
 BASE = Scores(
     frames=40,
@@ -89,3 +93,17 @@ def test_a_first_frame_s_time_that_is_not_known_is_a_dash_and_an_empty_cell() ->
     assert "nan" not in markdown(summarize([unknown])) + plain(summarize([unknown])) + rows_csv([unknown])
     assert summarize([unknown])[0].first_frame_s is None
     assert summarize([known, unknown])[0].first_frame_s == 0.5
+
+
+def test_a_row_is_read_back_from_the_metrics_of_a_flight(tmp_path: Path) -> None:
+    names = {"flight": "f", "method": "mask", "first_frame_s": 0.5}
+    path = tmp_path / "metrics.json"
+    for scores in (BASE, NEVER):
+        path.write_text(metrics_json(scores, 0.25, names))
+        assert read_row(path) == FlightRow("f", 0, "mask", scores, 0.25, 0.5)
+    old = {k: v for k, v in asdict(BASE).items() if k != "share_smoothed"}
+    path.write_text(json.dumps(old | {"seconds_per_frame": 0.25, "flight": "f", "method": "mask"}))
+    assert read_row(path).scores == BASE
+    path.write_text("[1, 2]")
+    with pytest.raises(InputError, match=r"metrics\.json is not a metrics\.json of brmgeo localize"):
+        read_row(path)

@@ -14,9 +14,8 @@ import numpy as np
 import pyogrio
 import pytest
 import rasterio
-import shapely
 from pyproj import Transformer
-from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, bytes_of, edit
+from small_flights import COLS, CRS, REAL, ROWS, Said, bytes_of, edit
 
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
@@ -360,16 +359,6 @@ def test_commands_refuse_what_cannot_be(
     assert "no building" in say("localize", "--maps", empty, "--flight", flight, "--out", out).line
     assert not out.exists()
 
-    simulate = ("simulate", "--maps", maps, "--out", tmp_path / "s")
-    assert "rectangel" in say(*simulate, "--path", "rectangel").line
-    assert "GeoJSON" in say(*simulate, "--path", maps / "ratio.tif").line
-    assert "--name" in say(*simulate, "--count", 2, "--name", "n").line
-    assert "generated REGION" in say(*simulate, "--season", "winter").line
-    for name in ("buildings.tif", "ratio.tif"):
-        shutil.copy(maps / name, empty)
-    assert "footprints.gpkg" in say("simulate", "--maps", empty, "--out", tmp_path / "s").line
-    assert not (tmp_path / "s").exists()
-
 
 def test_folders_with_other_files_are_never_replaced(
     maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], waypoints: Path
@@ -411,16 +400,11 @@ def test_folders_with_other_files_are_never_replaced(
     assert {p.name for p in tmp_path.iterdir()} == {"mine", "flight"}
 
 
-def test_results_and_simulated_flights_are_replaced(
-    maps: Path, waypoints: Path, results: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_results_are_replaced(results: Path, tmp_path: Path) -> None:
     ours = tmp_path / "ours"
     shutil.copytree(results / "paper", ours)
     (ours / "simulated-1.qgz~").write_bytes(b"of QGIS")
     job._may_replace_results(ours)
-    shutil.copytree(whole, tmp_path / "flight")
-    job._may_replace_flight(tmp_path / "flight")
-    job._may_replace_flight(tmp_path / "new")
     job._may_replace_results(tmp_path / "new")
 
 
@@ -452,26 +436,6 @@ def test_the_caption_of_the_candidates_counts_what_is_drawn() -> None:
     assert of(2000, 1_234_567) == "2,000 of the 1,234,567 places that fit"
 
 
-def test_the_flight_that_localize_makes_has_a_name_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, maps: Path
-) -> None:
-    made: list[tuple[Path, str]] = []
-
-    def simulate(what: job.Simulation, seed: int, out: Path, name: str) -> Path:
-        made.append((out, name))
-        out.mkdir(parents=True)
-        return out
-
-    monkeypatch.setattr(job, "simulate_flight", simulate)
-    monkeypatch.setattr(job, "native_imagery", lambda *_: None)
-    region = job.Region.model_construct(name="r", flight=FlightSettings(), imagery=None)
-    assert job.default_flight(region, maps, tmp_path, 1) == made[0][0]
-    # brmgeo simulate calls its own flights simulated-SEED.
-    assert [name for _, name in made] == ["default-1"] == [made[0][0].name]
-    job.default_flight(region, maps, tmp_path, 1)
-    assert len(made) == 1
-
-
 def test_a_crash_while_writing_leaves_the_old_results(
     maps: Path, whole: Path, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -487,123 +451,6 @@ def test_a_crash_while_writing_leaves_the_old_results(
         job.localize(maps, whole, "mask", out)
     assert bytes_of(out) == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-# ---------------------------------------------------------------- simulate and evaluate
-
-
-def test_simulate_gives_the_same_bytes_and_counts_seeds(
-    maps: Path, waypoints: Path, tmp_path: Path, say: Callable[..., Said]
-) -> None:
-    words = ("simulate", "--maps", maps, "--path", waypoints)
-    for name in "ab":
-        assert say(*words, "--mode", "both", "--seed", 3, "--out", tmp_path / name).code == 0
-    both = bytes_of(tmp_path / "a")
-    assert both == bytes_of(tmp_path / "b")
-    assert {
-        "flight.toml",
-        "frames.csv",
-        "odometry.tum",
-        "imu.csv",
-        "altimeter.csv",
-        "reference.csv",
-    } <= both.keys()
-    assert any(n.startswith("frames/") for n in both)
-    assert any(n.startswith("masks/") for n in both)
-
-    said = say(*words, "--mode", "masks", "--seed", 3, "--count", 2, "--out", tmp_path / "many")
-    assert said.code == 0
-    assert sorted(p.name for p in (tmp_path / "many").iterdir()) == ["simulated-3", "simulated-4"]
-    assert say(*words, "--mode", "masks", "--seed", 4, "--out", tmp_path / "four").code == 0
-    assert bytes_of(tmp_path / "four") == bytes_of(tmp_path / "many/simulated-4")
-    assert bytes_of(tmp_path / "four") != bytes_of(tmp_path / "many/simulated-3")
-    assert say(*words, "--no-odometry", "--mode", "masks", "--out", tmp_path / "none").code == 0
-    assert not (tmp_path / "none/odometry.tum").exists()
-    assert read_flight(tmp_path / "none").odometry is None
-
-
-@pytest.mark.parametrize("path", job.PATHS)
-def test_named_paths_stay_on_the_map(maps: Path, path: str) -> None:
-    built = read_maps(maps)
-    assert built.footprints is not None
-    for seed in range(3):
-        try:
-            route = job.flight_path(path, job.read_ground(built.footprints), seed, built.bounds, built.crs)
-        except job.InputError as error:
-            assert "does not fit" in str(error)  # noqa: PT017
-            continue
-        left, bottom, right, top = built.bounds
-        assert ((route >= [left, bottom]) & (route <= [right, top])).all()
-
-
-def test_evaluate_writes_the_table_and_compares_results(
-    maps: Path, waypoints: Path, results: Path, tmp_path: Path, say: Callable[..., Said]
-) -> None:
-    out = tmp_path / "table"
-    words = (
-        "evaluate",
-        "--maps",
-        maps,
-        "--flights",
-        2,
-        "--path",
-        waypoints,
-        "--methods",
-        "mask,paper",
-        "--out",
-        out,
-    )
-    said = say(*words)
-    assert said.code == 0, said.err
-    rows = list(csv.DictReader((out / "flights.csv").read_text().splitlines()))
-    assert [(r["seed"], r["method"]) for r in rows] == [
-        ("1", "mask"),
-        ("1", "paper"),
-        ("2", "mask"),
-        ("2", "paper"),
-    ]
-    assert {
-        "first_fix_m",
-        "rmse_whole_m",
-        "rmse_after_first_fix_m",
-        "false_fixes",
-        "odometry_rmse_m",
-    } <= rows[0].keys()
-    assert rows[0]["odometry_rmse_m"] == rows[1]["odometry_rmse_m"] != ""
-    text = (out / "summary.md").read_text()
-    table = [line for line in text.splitlines() if line.startswith("|")]
-    assert len(table) == 4
-    assert len({line.count("|") for line in table}) == 1
-    assert "mask" in said.out
-    assert "paper" in said.out
-    assert "method 'x'" in say(*words[:-4], "--methods", "mask,x", "--out", out).line
-
-    shutil.copytree(results, tmp_path / "results")
-    said = say("evaluate", "--results", tmp_path / "results", "--out", tmp_path / "compared")
-    assert said.code == 0, said.err
-    rows = list(csv.DictReader((tmp_path / "compared/flights.csv").read_text().splitlines()))
-    for row in rows:
-        metrics = json.loads((tmp_path / "results" / row["method"] / "metrics.json").read_text())
-        assert float(row["odometry_rmse_m"]) == pytest.approx(metrics["odometry_rmse_m"], abs=1e-3)
-        assert row["false_fixes"] == str(metrics["false_fixes"])
-    assert {r["method"] for r in rows} == set(METHODS)
-    (tmp_path / "results/mask/metrics.json").write_text("{}")
-    assert "metrics.json" in say("evaluate", "--results", tmp_path / "results").line
-    assert "no metrics.json" in say("evaluate", "--results", tmp_path / "compared").line
-
-
-def test_hidden_half_of_the_map_is_never_found(maps: Path, tmp_path: Path) -> None:
-    built = read_maps(maps)
-    for side in ("east", "west", "north", "south"):
-        kept, (left, bottom, right, top) = job._half_hidden(built, side)
-        rows, cols = kept.building.shape
-        kept_box = shapely.box(
-            kept.left, kept.top - rows * kept.gsd_m, kept.left + cols * kept.gsd_m, kept.top
-        )
-        assert not kept_box.intersects(shapely.box(left, bottom, right, top))
-        assert rows * cols == ROWS * COLS // 2
-        row, col = round((TOP - kept.top) / GSD), round((kept.left - LEFT) / GSD)
-        assert (kept.building == built.ground.building[row : row + rows, col : col + cols]).all()
 
 
 # ---------------------------------------------------------------- the real flight
@@ -674,37 +521,3 @@ def test_real_flight_is_found_by_the_odometry_of_its_own_photos(
     assert metrics["false_fixes"] == 0
     assert metrics["share_converged"] > 0.5
     assert metrics["rmse_after_first_fix_m"] < 1.5
-
-
-def test_evaluate_keeps_the_flights_that_were_flown_where_one_breaks_off(
-    maps: Path, say: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fly = job.fly_trial
-
-    def flown(trial: job.Trial) -> list[job.FlightRow]:
-        if trial.seed == 2:
-            raise ValueError("a root of\na negative number")
-        return fly(trial)
-
-    monkeypatch.setattr(job, "fly_trial", flown)
-    out = tmp_path / "table"
-    said = say(
-        "evaluate",
-        "--maps",
-        maps,
-        "--out",
-        out,
-        "--flights",
-        3,
-        "--methods",
-        "paper",
-        "--scheduler",
-        "serial",
-    )
-    assert "1 of 3 flights broke off (seed 2: ValueError: a root of a negative number)" in said.line
-    rows = csv.DictReader((out / "flights.csv").read_text(encoding="utf-8").splitlines())
-    assert [row["seed"] for row in rows] == ["1", "3"]
-    summary = (out / "summary.md").read_text(encoding="utf-8")
-    assert "2 simulated masks-only flights" in summary
-    assert "seed 2: ValueError" in summary
-    assert sorted(p.name for p in out.iterdir()) == ["flights.csv", "summary.md"]

@@ -6,7 +6,6 @@ buildings are bright: what comes out can be worked out by hand.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import shutil
@@ -259,51 +258,6 @@ def test_bad_weights_are_refused_before_anything_is_done(
     assert "SHA-256 differs" in say(*words, bad).line
     assert "no such weights" in say(*words, tmp_path / "none.safetensors").line
     assert not (tmp_path / "out").exists()
-
-
-def test_the_same_flights_with_several_kinds_of_masks(
-    maps: Path, waypoints: Path, weights: Path, tmp_path: Path, say: Say
-) -> None:
-    words = ("evaluate", "--maps", maps, "--out", tmp_path, "--flights", 1, "--path", waypoints)
-    said = say(
-        *words, "--methods", "mask", "--masks", "true,network,degraded", "--weights", weights, "--looks", 2
-    )
-    assert said.code == 0, said.err
-    rows = list(csv.DictReader((tmp_path / "flights.csv").read_text().splitlines()))
-    by = {r["method"]: r for r in rows}
-    assert len(rows) == 3
-    assert set(by) == {f"mask, {kind} masks" for kind in ("true", "network", "degraded")}
-    assert len({r["odometry_rmse_m"] for r in rows}) == 1
-    assert all(int(r["false_fixes"]) == 0 for r in rows)
-    assert float(by["mask, network masks"]["rmse_after_first_fix_m"]) < 3
-    text = (tmp_path / "summary.md").read_text()
-    assert "network bright abababababab, two looks on rendered frames" in text
-    assert "accuracy of 0.916" in text
-    assert "'perfect' is not known" in say(*words, "--masks", "perfect").line
-    for option in (("--weights", weights), ("--looks", 1)):
-        assert "give --masks network too" in say(*words, "--masks", "true", *option).line
-
-
-def test_sift_is_compared_on_the_same_flights(maps: Path, waypoints: Path, tmp_path: Path, say: Say) -> None:
-    words = ("evaluate", "--maps", maps, "--out", tmp_path, "--flights", 1, "--path", waypoints)
-    said = say(*words, "--methods", "mask", "--sift")
-    assert said.code == 0, said.err
-    rows = {r["method"]: r for r in csv.DictReader((tmp_path / "flights.csv").read_text().splitlines())}
-    assert set(rows) == {"mask", "SIFT"}
-    assert rows["SIFT"]["odometry_rmse_m"] == rows["mask"]["odometry_rmse_m"]
-    assert rows["SIFT"]["frames"] == rows["mask"]["frames"]
-    # Frames drawn from the very imagery that they are matched to: the easiest case there is.
-    assert float(rows["SIFT"]["share_converged"]) > 0
-    assert float(rows["SIFT"]["median_after_first_fix_m"]) < 10
-    text = (tmp_path / "summary.md").read_text()
-    assert "easier than a real camera" in text
-    assert "masks-only" not in text
-    # It states no covariance, and its time is that of finding a place, not of drawing the frame.
-    assert rows["SIFT"]["within_1_sigma"] == ""
-    assert float(rows["SIFT"]["seconds_per_frame"]) > 0
-    assert "needs a generated REGION" in say(*words, "--sift", "--season", "winter").line
-    assert "--hide does not hide" in say(*words, "--sift", "--hide", "east").line
-    assert "--methods: names none" in say(*words, "--methods", ",").line
 
 
 # ---------------------------------------------------------------- the real flight

@@ -13,7 +13,7 @@ import pytest
 from brmgeo.errors import MissingInputError, SettingsError
 from brmgeo.region import FlightSettings as OfRegion
 from brmgeo.synth.flight import FlightSettings, MaskErrors, OdometryErrors
-from pipelines.flights import Simulation
+from pipelines.simulate import Simulation
 from pipelines.simulation import read_simulation_settings
 
 DOCS = Path(__file__).parents[2] / "docs" / "FLIGHT.md"
