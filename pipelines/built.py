@@ -35,7 +35,8 @@ def maps_for(
     command: str, region: str | None, maps_dir: Path | None, data: Path, scheduler_spec: str | None
 ) -> BuiltMaps:
     """The maps of a region, built first where they are not fresh, or of a folder; SettingsError for both or neither."""
-    from pipelines.maps import build_region, credits
+    from pipelines.map_sources import credits
+    from pipelines.maps import build_region
 
     if (region is None) == (maps_dir is None):
         raise SettingsError(
