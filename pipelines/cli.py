@@ -883,11 +883,17 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
     "--format", "format_name", help="tum, euroc, kitti, vins-mono, vins-fusion or csv, of a text file."
 )
 @click.option("--quaternion", type=click.Choice(["wxyz", "xyzw"]), help="Order of a text file's quaternions.")
-@click.option("--times", type=FILE, help="Times of KITTI poses: a text file, one time a line.")
+@click.option(
+    "--times", "frame_times_s", type=FILE, help="Times of KITTI poses: a text file, one time a line."
+)
 @click.option("--photos", type=FILE, help="Photos taken at the camera triggers that the log tells.")
 @click.option("--video", type=FILE, help="A video of the flight.")
 @click.option(
-    "--video-start", type=float, default=0.0, help="The log's time at which the video begins, seconds."
+    "--video-start",
+    "video_start_s",
+    type=float,
+    default=0.0,
+    help="The log's time at which the video begins, seconds.",
 )
 @click.option("--fov", "fov_deg", type=float, help="Field of view across the short side, degrees.")
 @click.option("--camera", type=_Numbers(), help="fx,fy,cx,cy[,k1,k2,p1,p2,k3] in pixels.")
@@ -896,10 +902,15 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
     "--ground", "ground_m", type=float, help="Height of the ground above the GNSS altitude's datum, metres."
 )
 @click.option(
-    "--mount", type=_Numbers(3), default=(0.0, 0.0, 0.0), help="Camera in the body: roll,pitch,yaw degrees."
+    "--mount",
+    "mount_deg",
+    type=_Numbers(3),
+    default=(0.0, 0.0, 0.0),
+    help="Camera in the body: roll,pitch,yaw degrees.",
 )
 @click.option(
     "--body",
+    "body_deg",
     type=_Numbers(3),
     default=(0.0, 0.0, 0.0),
     help="The log's body in ours: roll,pitch,yaw degrees.",
@@ -918,7 +929,9 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
     type=click.FloatRange(min=0, min_open=True),
     help="Take at most this many frames a second.",
 )
-@click.option("--shift-frames", type=float, default=0.0, help="Seconds to add to the frames' times.")
+@click.option(
+    "--shift-frames", "shift_frames_s", type=float, default=0.0, help="Seconds to add to the frames' times."
+)
 def import_(
     log: Path,
     out: Path,
@@ -928,23 +941,23 @@ def import_(
     imu_topic: str | None,
     format_name: str | None,
     quaternion: Any,
-    times: Path | None,
+    frame_times_s: Path | None,
     photos: Path | None,
     video: Path | None,
-    video_start: float,
+    video_start_s: float,
     fov_deg: float | None,
     camera: tuple[float, ...] | None,
     agl_m: float | None,
     ground_m: float | None,
-    mount: tuple[float, ...],
-    body: tuple[float, ...],
+    mount_deg: tuple[float, ...],
+    body_deg: tuple[float, ...],
     axes: str,
     imu_units: str | None,
     rate_hz: float | None,
-    shift_frames: float,
+    shift_frames_s: float,
 ) -> None:
     """Make a flight folder of LOG: a ROS bag, PX4 or ArduPilot log, text of poses, or a folder of geotagged photos."""
-    from brmgeo.flight.logs import LogOptions
+    from brmgeo.flight.logs import ImportSettings, LogOptions
     from brmgeo.flight.tables import read_times
     from pipelines import logs as job
 
@@ -957,12 +970,30 @@ def import_(
             f"import: --camera has {len(camera)} numbers: give fx,fy,cx,cy or these and k1,k2,p1,p2,k3"
         )
     options = LogOptions(
-        topic, image_topic, imu_topic, quaternion, read_times(times) if times else None, format_name
+        topic=topic,
+        image_topic=image_topic,
+        imu_topic=imu_topic,
+        quaternion=quaternion,
+        frame_times_s=read_times(frame_times_s) if frame_times_s else None,
+        format=format_name,
     )
-    settings = job.ImportSettings(
-        options, name, photos, video, video_start, fov_deg, camera, agl_m, ground_m, mount, body, axes, units, rate_hz,
-        shift_frames,
-    )  # fmt: skip
+    settings = ImportSettings(
+        options=options,
+        name=name,
+        photos=photos,
+        video=video,
+        video_start_s=video_start_s,
+        fov_deg=fov_deg,
+        camera=camera,
+        agl_m=agl_m,
+        ground_m=ground_m,
+        mount_deg=mount_deg,
+        body_deg=body_deg,
+        axes=axes,
+        imu_units=units,
+        rate_hz=rate_hz,
+        shift_frames_s=shift_frames_s,
+    )
     for line in job.import_log(log, out, settings):
         click.echo(line)
     click.echo(f"wrote {out}")
@@ -971,15 +1002,20 @@ def import_(
 @cli.command()
 @click.argument("paths", type=FILE, nargs=-1, required=True)
 @click.option("--topic", help="The odometry to look at where the log holds several.")
-@click.option("--times", type=FILE, help="Times of KITTI poses: a text file, one time a line.")
+@click.option(
+    "--times", "frame_times_s", type=FILE, help="Times of KITTI poses: a text file, one time a line."
+)
 @click.option("--write", type=click.Path(path_type=Path), help="Write it as Markdown into this file.")
-def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, write: Path | None) -> None:
+def inspect(
+    paths: tuple[Path, ...], topic: str | None, frame_times_s: Path | None, write: Path | None
+) -> None:
     """Tell what is in PATHS (logs, bags, photo or flight folders): how long, how far, where, gaps, rates, units, faults."""
     from brmgeo.flight.logs import LogOptions
+    from brmgeo.flight.logs.inspect import inspect as look
     from brmgeo.flight.tables import read_times
     from pipelines import logs as job
 
-    options = LogOptions(topic, frame_times_s=read_times(times) if times else None)
+    options = LogOptions(topic, frame_times_s=read_times(frame_times_s) if frame_times_s else None)
     unread = 0
     if write is not None:
         if not write.absolute().parent.is_dir():
@@ -991,7 +1027,7 @@ def inspect(paths: tuple[Path, ...], topic: str | None, times: Path | None, writ
         click.echo(f"wrote {write}")
     for path in paths if write is None else ():
         try:
-            for line in job.inspect(path, options):
+            for line in look(path, options):
                 click.echo(line)
         except BrmgeoError as error:
             if len(paths) == 1:

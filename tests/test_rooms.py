@@ -47,7 +47,10 @@ ADAPTERS = {
     "brmgeo.ingest",
     "brmgeo.export",
     "brmgeo.flight.folder",
-    "brmgeo.flight.logs",
+    *(
+        f"brmgeo.flight.logs.{name}"
+        for name in ("ardupilot", "mavlink", "photos", "rosbag", "text", "ulog", "values")
+    ),
     "brmgeo.flight.odometry",
     "brmgeo.flight.poses",
     "brmgeo.flight.tables",

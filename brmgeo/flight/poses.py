@@ -118,7 +118,8 @@ def _text_reader(
                 lines[0],
                 "5-8",
                 f"read as {order} the aircraft would tumble; the columns look like {likely}: give quaternion = "
-                f'"{likely}" (or "{order}" if they are right) in [odometry] or as --quaternion',
+                f'"{likely}" (or "{order}" if they are right) in [odometry]',
+                needs="quaternion",
             )
         return found
 

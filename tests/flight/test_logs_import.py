@@ -24,8 +24,8 @@ from log_writers import (
 )
 
 from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.logs.inspect import inspect
 from pipelines import cli
-from pipelines.logs import inspect
 
 pytest.importorskip("rosbags")
 pytest.importorskip("pyulog")
@@ -160,7 +160,7 @@ def test_photos_become_a_whole_flight(tmp_path: Path) -> None:
     step = np.linalg.norm(np.diff(reference.xy_m, axis=0), axis=1)
     assert step == pytest.approx(np.full(4, 11.1), abs=0.1)
     plain = shots(tmp_path / "plain", 3)
-    assert "tells no height: give --agl" in refused(tmp_path / "a", plain)
+    assert "(--agl FLOAT)" in refused(tmp_path / "a", plain)
     assert [f.agl_m for f in good(tmp_path / "b", plain, "--agl", 80).frames] == [80.0] * 3
     assert [f.agl_m for f in good(tmp_path / "c", plain, "--ground", 40).frames] == [120.0] * 3
 
@@ -175,7 +175,7 @@ def test_text_needs_no_library_and_its_body_can_be_turned(tmp_path: Path) -> Non
     path.write_text("\n".join(",".join(f"{v:.9f}" for v in (t, *p, *q)) for t, p, q in zip(T, XYZ, turned)))
     said = refused(tmp_path / "a", path)
     assert "its +x axis points up" in said
-    assert "--body 0,-90,0" in said
+    assert "body_deg 0,-90,0" in said
     status, _ = run("import", path, "--out", tmp_path / "b", "--body", "0,-90,0")
     assert status == 0
     from brmgeo.flight.odometry import read_odometry
@@ -187,9 +187,11 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     late = bag(tmp_path / "late", "mcap", imu_late_s=0.9, topics=("odom", "imu"))
     assert "clocks are not synchronised" in refused(tmp_path / "a", late)
     degrees = bag(tmp_path / "deg", "mcap", imu_scale=(180 / np.pi, 1.0), topics=("odom", "imu"))
-    assert "it is in deg/s, not rad/s: give --imu-units deg/s" in refused(tmp_path / "b", degrees)
+    assert "it is in deg/s, not rad/s: give imu_units deg/s (--imu-units TEXT)" in refused(
+        tmp_path / "b", degrees
+    )
     gravity = bag(tmp_path / "g", "mcap", imu_scale=(1.0, 1 / 9.80665), topics=("odom", "imu"))
-    assert "it is in g, not m/s2: give --imu-units g" in refused(tmp_path / "c", gravity)
+    assert "it is in g, not m/s2: give imu_units g (--imu-units TEXT)" in refused(tmp_path / "c", gravity)
     assert run("import", gravity, "--out", tmp_path / "d", "--imu-units", "g")[0] == 0
     for path, word in ((late, "synchronised"), (degrees, "deg/s"), (gravity, "it is in g")):
         assert any(word in line for line in inspect(path) if line.startswith("  FAULT"))
@@ -204,13 +206,15 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     assert any("look like wxyz" in line for line in inspect(order) if line.startswith("  FAULT"))
 
     two = bag(tmp_path / "two", "mcap", topics=("odom",), twice=True)
-    assert "choose one of /vins/odometry" in refused(tmp_path / "h", two)
+    assert "choose one of /vins/odometry (400), /other/odometry (400) (--topic TEXT)" in refused(
+        tmp_path / "h", two
+    )
     assert "is there already" in run("import", order, "--out", tmp_path / "n")[1]
     assert "--imu-units 'furlong' is unknown" in refused(tmp_path / "i", order, "--imu-units", "furlong")
     assert "--camera has 3 numbers" in refused(tmp_path / "j", order, "--camera", "1,2,3")
     images = bag(tmp_path / "images", "mcap", topics=("odom", "image"))
     assert "tells no height" in refused(tmp_path / "k", images)
-    assert "field of view: give --fov" in refused(tmp_path / "l", images, "--agl", 60)
+    assert "(--fov FLOAT)" in refused(tmp_path / "l", images, "--agl", 60)
     assert good(tmp_path / "m", images, "--agl", 60, "--fov", 43).frames[3].agl_m == 60.0
 
 

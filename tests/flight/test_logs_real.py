@@ -11,8 +11,9 @@ import pytest
 
 from brmgeo.errors import FlightError
 from brmgeo.flight import checks, frames
-from brmgeo.flight.logs import Log, LogOptions, read_log
-from pipelines.logs import ImportSettings, gnss_track, import_log, inspect
+from brmgeo.flight.logs import ImportSettings, Log, LogOptions, read_log
+from brmgeo.flight.logs.inspect import gnss_track, inspect
+from pipelines.logs import import_log
 
 DATA = Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).parents[2] / "../shared/data"))
 LOGS = DATA / "logs"

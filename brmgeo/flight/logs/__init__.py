@@ -10,13 +10,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 from brmgeo.errors import FlightError, MissingInputError
-from brmgeo.flight.logs.values import PHOTO_SUFFIXES, CameraFrames, Gnss, Height, Log, LogOptions, Orientation
+from brmgeo.flight.logs.values import (
+    PHOTO_SUFFIXES,
+    CameraFrames,
+    Gnss,
+    Height,
+    ImportSettings,
+    Log,
+    LogOptions,
+    Orientation,
+)
 
 __all__ = [
     "READERS",
     "CameraFrames",
     "Gnss",
     "Height",
+    "ImportSettings",
     "Log",
     "LogOptions",
     "Orientation",

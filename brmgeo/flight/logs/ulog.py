@@ -211,7 +211,8 @@ def _odometry(
     if not (ned.all() or frd.all()):
         raise FlightError(
             f"{path}: {name}: its pose frames are {sorted({int(f) for f in frame})}, not NED or FRD throughout: "
-            "choose another with --topic"
+            "choose another",
+            needs="topic",
         )
     keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
     t, xyz, q = t[keep], xyz[keep], q[keep]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,34 @@ class LogOptions:
     format: str | None = None
     any_topic: bool = False
     only_odometry: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ImportSettings:
+    """What may be told besides the log when a flight is made of it.
+
+    ``photos`` and ``video`` stand in for pictures that the log does not hold; ``video_start_s`` is the log's time at
+    which the video begins. ``camera`` is fx, fy, cx, cy[, k1, k2, p1, p2, k3]. ``body_deg`` and ``mount_deg`` are roll,
+    pitch, yaw: of the log's body in ours, and of the camera in the body. ``axes`` is ``flu`` or ``optical``.
+    ``imu_units`` are units that the log is known to be in, such as ("deg/s", "g"). ``shift_frames_s`` is added to the
+    frames' times.
+    """
+
+    options: LogOptions = field(default_factory=LogOptions)
+    name: str | None = None
+    photos: Path | None = None
+    video: Path | None = None
+    video_start_s: float = 0.0
+    fov_deg: float | None = None
+    camera: tuple[float, ...] | None = None
+    agl_m: float | None = None
+    ground_m: float | None = None
+    mount_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    body_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    axes: str = "flu"
+    imu_units: tuple[str, ...] = ()
+    rate_hz: float | None = None
+    shift_frames_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
