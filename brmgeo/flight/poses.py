@@ -169,7 +169,7 @@ def _read_kitti(path: Path, options: OdometryOptions) -> Odometry:
                 f"{len(cells)} poses for {have}: KITTI has no times, so it needs one pose a frame, or a file of times "
                 "(times in [odometry] of flight.toml)"
             )
-        raise refuse(path, None, None, message, needs="times")
+        raise refuse(path, None, None, message, needs="frame_times_s")
     poses = np.array([[number(path, n, k + 1, c) for k, c in enumerate(r)] for r, n in zip(cells, lines)])
     poses = poses.reshape(-1, 3, 4)
     rotation = poses[:, :, :3]
