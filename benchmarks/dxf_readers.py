@@ -24,7 +24,8 @@ import ezdxf
 import numpy as np
 import pyogrio
 
-from brmgeo.ingest.dxf import DEFAULT_LAYERS, read_dxf
+from brmgeo.codes import BUILDING_LAYERS
+from brmgeo.ingest.dxf import read_dxf
 
 ROUNDS = 3
 REAL = (
@@ -57,7 +58,7 @@ def write_sheet(path: Path, version: str, entities: int = 30_000, seed: int = 1)
         if share < 2:
             w, h = rng.uniform(5.0, 25.0, 2)
             square = np.array([[0, 0], [w, 0], [w, h], [w / 2, h], [w / 2, h * 1.4], [0, h * 1.4]])
-            polyline(at + square, DEFAULT_LAYERS[i % 8], True)
+            polyline(at + square, BUILDING_LAYERS[i % 8], True)
         elif share < 8:
             walk = at + np.cumsum(rng.normal(0.0, 3.0, (vertices, 2)), axis=0)
             polyline(walk, others[i % len(others)], False)
@@ -78,7 +79,7 @@ def with_brmgeo(path: Path) -> int:
 
 
 def with_ezdxf(path: Path) -> int:
-    wanted = set(DEFAULT_LAYERS)
+    wanted = set(BUILDING_LAYERS)
     rings = []
     for entity in ezdxf.readfile(path).modelspace():
         if entity.dxf.layer not in wanted:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 # Building masks of maps (buildings.tif): uint8.
 OTHER, BUILDING, UNKNOWN = 0, 1, 255
 
@@ -26,10 +28,30 @@ BUILDING_KINDS = {
     "B0014117": "greenhouse",
     "B0014118": "temporary",
 }
+#: What the vector edition and map users call the kinds.
+KOREAN_KINDS = {
+    "unclassified": ("미분류",),
+    "non-residential": ("주택외건물",),
+    "house": ("주택", "일반주택", "단독주택"),
+    "row-house": ("연립주택",),
+    "under-construction": ("공사중건물",),
+    "apartment": ("아파트",),
+    "wall-less": ("무벽건물",),
+    "greenhouse": ("온실",),
+    "temporary": ("가건물",),
+}
 #: Layers that are buildings without being asked for: all but "unclassified".
 BUILDING_LAYERS = tuple(code for code in BUILDING_KINDS if code != "B0014110")
 #: Bounds a group of houses, and is no building.
 GROUP_BOUNDARY_LAYER = "B0014119"
+#: The frame of a sheet.
+NEATLINE_LAYER = "H0017334"
+
+
+def layer_code(name: str) -> str:
+    """The NGII code of a building layer, "B0014112" for "b0014112" and for the older "4112"; other names as they are."""
+    upper = name.strip().upper()
+    return f"B001{upper}" if re.fullmatch(r"411\d", upper) else upper
 
 
 def disc_radii(largest: float, n: int) -> tuple[float, ...]:

@@ -19,12 +19,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from brmgeo.codes import BUILDING, UNKNOWN
 from brmgeo.flight.values import Estimate
 
 Extent = tuple[float, float, float, float]
 
 REFERENCE, ODOMETRY, ONLINE, SMOOTHED, CANDIDATE = "#111111", "#d1495b", "#f2a541", "#1b7fbd", "#e63946"
 STATUS_COLOUR = {"converged": "#2a9d5c", "ambiguous": "#f2a541", "lost": "#8d99ae"}
+# Colour of each value of a building map.
+_PALETTE = np.full((256, 3), 245, np.uint8)
+_PALETTE[BUILDING], _PALETTE[UNKNOWN] = (92, 103, 125), (215, 215, 215)
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -194,9 +198,7 @@ def seen_figure(frames: Sequence[Seen]) -> bytes:
                     0.5, 0.5, "no fix", ha="center", va="center", transform=ground.transAxes, color="#5c677d"
                 )
                 continue
-            palette = np.full((256, 3), 245, np.uint8)
-            palette[1], palette[255] = (92, 103, 125), (215, 215, 215)
-            ground.imshow(palette[seen.ground], interpolation="antialiased")
+            ground.imshow(_PALETTE[seen.ground], interpolation="antialiased")
             if (seen.view >= 0.5).any() and (seen.view < 0.5).any():
                 ground.contour(seen.view, levels=[0.5], colors=[CANDIDATE], linewidths=0.9)
         heads = ["camera"] * pictures + ["mask, levelled, nose up", "map at the fix, mask in red"]
@@ -287,9 +289,7 @@ def _ground(axes: Axes, background: Background, box: Extent, pale: bool = False)
     left, bottom, right, top = background.bounds
     pixels = background.pixels
     if pixels.ndim == 2:
-        palette = np.full((256, 3), 245, np.uint8)
-        palette[1], palette[255] = (92, 103, 125), (215, 215, 215)
-        pixels = palette[pixels]
+        pixels = _PALETTE[pixels]
     if pale:
         pixels = (pixels.astype(np.float32) * 0.45 + 255 * 0.55).astype(np.uint8)
     axes.imshow(pixels, extent=(left, right, bottom, top), interpolation="antialiased")

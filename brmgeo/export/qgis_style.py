@@ -14,24 +14,27 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from brmgeo.codes import BUILDING, BUILDING_KINDS, KOREAN_KINDS, OTHER, UNKNOWN, layer_code
+
 QGIS_VERSION = "3.22.0"
 Style = list[ET.Element]
 GEOMETRY_TYPES = {"Point": 0, "Line": 1, "Polygon": 2}
 
-# NGII building layers: the last digit of B001411x (older maps: 411x) tells the kind, and so do the names that
-# ingest gives and the Korean ones of the vector edition. Colours keep apart for colour-blind readers and stand
-# out on imagery.
-KINDS: tuple[tuple[str, tuple[str, ...], str, str], ...] = (
-    ("2", ("house", "주택", "일반주택", "단독주택"), "House (주택)", "#f2a541"),
-    ("3", ("row-house", "연립주택"), "Row house (연립주택)", "#e0662f"),
-    ("5", ("apartment", "아파트"), "Apartments (아파트)", "#d45087"),
-    ("1", ("non-residential", "주택외건물"), "Non-residential (주택외건물)", "#4aa8e0"),
-    ("6", ("wall-less", "무벽건물"), "Canopy, no walls (무벽건물)", "#b8bcc4"),
-    ("7", ("greenhouse", "온실"), "Greenhouse (온실)", "#3fb68b"),
-    ("8", ("temporary", "가건물"), "Temporary (가건물)", "#f0e05a"),
-    ("4", ("under-construction", "공사중건물"), "Under construction (공사중건물)", "#a9714b"),
-    ("0", ("unclassified", "미분류", "건물"), "Unclassified building", "#9a86d6"),
-)
+# Kind of building -> (label, colour), in the order of a legend. Colours keep apart for colour-blind readers and stand out
+# on imagery.
+KINDS = {
+    "house": ("House (주택)", "#f2a541"),
+    "row-house": ("Row house (연립주택)", "#e0662f"),
+    "apartment": ("Apartments (아파트)", "#d45087"),
+    "non-residential": ("Non-residential (주택외건물)", "#4aa8e0"),
+    "wall-less": ("Canopy, no walls (무벽건물)", "#b8bcc4"),
+    "greenhouse": ("Greenhouse (온실)", "#3fb68b"),
+    "temporary": ("Temporary (가건물)", "#f0e05a"),
+    "under-construction": ("Under construction (공사중건물)", "#a9714b"),
+    "unclassified": ("Unclassified building", "#9a86d6"),
+}
+_KIND_OF_NAME = {name: kind for kind, names in KOREAN_KINDS.items() for name in (kind, *names)}
+_KIND_OF_NAME["건물"] = "unclassified"
 OTHER_COLOUR = "#9a86d6"
 STATUS_COLOURS = {"converged": "#35e0c8", "ambiguous": "#ffb02e", "lost": "#ff5d5d"}
 # Share of building: fine steps where countryside and villages differ, the whole of 0..1 so that maps compare.
@@ -50,12 +53,8 @@ RATIO_STOPS: tuple[tuple[float, str, int], ...] = (
 
 def kind_of(value: str) -> tuple[str, str] | None:
     """(label, colour) of an NGII layer code (``B0014112``, ``4112``) or of a kind (``house``), None for anything else."""
-    code = value.strip().upper()
-    digit = code[-1:] if code[:-1] in ("B001411", "411") else None
-    for last, names, label, colour in KINDS:
-        if digit == last or value.strip() in names:
-            return label, colour
-    return None
+    kind = BUILDING_KINDS.get(layer_code(value)) or _KIND_OF_NAME.get(value.strip())
+    return None if kind is None else KINDS[kind]
 
 
 def rgba(colour: str, alpha: int = 255) -> str:
@@ -338,9 +337,9 @@ def mask_style(colour: str = "#ff4d4d", alpha: int = 150) -> Style:
         "rasterrenderer", type="paletted", band="1", alphaBand="-1", opacity="1", nodataColor=""
     )
     palette = sub(renderer, "colorPalette")
-    sub(palette, "paletteEntry", value=0, color="#ffffff", alpha=0, label="No building")
-    sub(palette, "paletteEntry", value=1, color=colour, alpha=alpha, label="Building")
-    sub(palette, "paletteEntry", value=255, color="#6b7280", alpha=110, label="Unknown (no sheet here)")
+    sub(palette, "paletteEntry", value=OTHER, color="#ffffff", alpha=0, label="No building")
+    sub(palette, "paletteEntry", value=BUILDING, color=colour, alpha=alpha, label="Building")
+    sub(palette, "paletteEntry", value=UNKNOWN, color="#6b7280", alpha=110, label="Unknown (no sheet here)")
     return _pipe(renderer, smooth=False)
 
 
@@ -378,7 +377,7 @@ def footprints_style(attribute: str | None, values: Sequence[str]) -> Style:
     if attribute is None:
         return [single(fill(OTHER_COLOUR, 110, OTHER_COLOUR, 0.3))]
     known: list[tuple[str, str, str]] = []
-    for _, _, label, colour in KINDS:
+    for label, colour in KINDS.values():
         known += [(v, label, colour) for v in sorted(values) if kind_of(v) == (label, colour)]
     known += [(v, v.capitalize(), OTHER_COLOUR) for v in sorted(values) if kind_of(v) is None and v]
     categories = [(v, label, [fill(colour, 120, colour, 0.3)]) for v, label, colour in known]

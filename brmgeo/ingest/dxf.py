@@ -37,23 +37,10 @@ from ezdxf.filemanagement import readfile
 from ezdxf.math import OCS
 from numpy.typing import NDArray
 
+from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, NEATLINE_LAYER, layer_code
 from brmgeo.errors import InputError, SettingsError, one_line
 from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings
 
-KIND_OF_LAYER: dict[str, str] = {
-    "B0014110": "unclassified",
-    "B0014111": "non-residential",
-    "B0014112": "house",
-    "B0014113": "row-house",
-    "B0014114": "under-construction",
-    "B0014115": "apartment",
-    "B0014116": "wall-less",
-    "B0014117": "greenhouse",
-    "B0014118": "temporary",
-}
-DEFAULT_LAYERS: tuple[str, ...] = tuple(f"B001411{i}" for i in range(1, 9))
-GROUP_BOUNDARY_LAYER = "B0014119"
-NEATLINE_LAYER = "H0017334"
 SNAP_M = 0.10
 SAGITTA_M = 0.01
 MAX_DROPPED_SHARE = 0.05
@@ -72,7 +59,7 @@ class SheetFootprints:
 
     Attributes:
         footprints: GeoDataFrame without CRS (a DXF has none): ``geometry`` (valid polygons, metres, as drawn),
-            ``layer`` (code), ``kind`` (see KIND_OF_LAYER, "other" for layers of your own), ``handle`` (of the
+            ``layer`` (code), ``kind`` (see codes.BUILDING_KINDS, "other" for layers of your own), ``handle`` (of the
             entity), ``source`` (file name).
         neatline: the sheet frame (layer H0017334), or None when the sheet has none.
         repairs: what was repaired or dropped, where.
@@ -90,7 +77,7 @@ class SheetFootprints:
 
 def read_dxf(
     path: str | Path,
-    layers: Sequence[str] = DEFAULT_LAYERS,
+    layers: Sequence[str] = BUILDING_LAYERS,
     *,
     snap_m: float = SNAP_M,
     sagitta_m: float = SAGITTA_M,
@@ -128,7 +115,7 @@ def read_dxf(
     frame = gpd.GeoDataFrame(
         {
             "layer": layer.astype(object),
-            "kind": _objects([KIND_OF_LAYER.get(name, "other") for name in layer]),
+            "kind": _objects([BUILDING_KINDS.get(name, "other") for name in layer]),
             "handle": rings.handles[repaired.origin],
             "source": _objects([path.name] * len(layer)),
         },
@@ -154,17 +141,11 @@ def read_dxf(
     return SheetFootprints(frame, _neatline(tags, snap_m, sagitta_m), repairs, counts, share)
 
 
-def layer_code(name: str) -> str:
-    """The NGII code of a building layer, "B0014112" for "b0014112" and for the older "4112"; other names as they are."""
-    upper = name.strip().upper()
-    return f"B001{upper}" if re.fullmatch(r"411\d", upper) else upper
-
-
 def _wanted_layers(layers: Sequence[str]) -> dict[bytes, str]:
     """Layer name as it may stand in a file (upper case, either encoding) -> the name that results carry."""
     if isinstance(layers, str) or not layers:
         raise SettingsError(
-            f"layers must be a list of layer names, such as {list(DEFAULT_LAYERS[:2])}, not {layers!r}"
+            f"layers must be a list of layer names, such as {list(BUILDING_LAYERS[:2])}, not {layers!r}"
         )
     wanted: dict[bytes, str] = {}
     for name in layers:

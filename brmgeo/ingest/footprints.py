@@ -27,11 +27,12 @@ import pyogrio
 import shapely
 from numpy.typing import NDArray
 
+from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KOREAN_KINDS
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
-from brmgeo.ingest.dxf import DEFAULT_LAYERS, KIND_OF_LAYER, MAX_DROPPED_SHARE, SNAP_M, read_dxf
+from brmgeo.ingest.dxf import MAX_DROPPED_SHARE, SNAP_M, read_dxf
 from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings, shape_keys
 
 COLUMNS = ("geometry", "layer", "kind", "floors", "handle", "source", "sheet")
@@ -41,19 +42,7 @@ EDGE_TOLERANCE_M = 0.05
 # Neatlines agree with the sheet number to less than a millimetre; a wrong datum moves them by some 300 m.
 NEATLINE_TOLERANCE_M = 5.0
 
-_KINDS = {
-    "미분류": "unclassified",
-    "일반주택": "house",
-    "단독주택": "house",
-    "주택": "house",
-    "연립주택": "row-house",
-    "아파트": "apartment",
-    "공사중건물": "under-construction",
-    "무벽건물": "wall-less",
-    "온실": "greenhouse",
-    "가건물": "temporary",
-    "주택외건물": "non-residential",
-}
+_KIND_OF_NAME = {name: kind for kind, names in KOREAN_KINDS.items() for name in names}
 _KIND_COLUMNS = ("kind", "종류")
 _FLOOR_COLUMNS = ("floors", "층수", "building:levels")
 
@@ -64,7 +53,7 @@ class Footprints:
 
     Attributes:
         frame: GeoDataFrame in the region's CRS with COLUMNS: ``geometry`` valid polygons; ``layer`` (DXF layer or the
-            file's layer name); ``kind`` (see dxf.KIND_OF_LAYER; "" when unknown); ``floors`` Int32, missing when
+            file's layer name); ``kind`` (see codes.BUILDING_KINDS; "" when unknown); ``floors`` Int32, missing when
             unknown; ``handle`` (DXF handle or feature number from 1); ``source`` file name; ``sheet`` number or "".
         sheets: GeoDataFrame with SHEET_COLUMNS, one row a file: where the file says what is built, and by what ``outline``
             that is known: "neatline", "number" (the sheet number's cell) or "extent" (only the data's bounds).
@@ -85,7 +74,7 @@ def read_footprints(
     source_crs: str | None = None,
     layer: str | None = None,
     encoding: str | None = None,
-    layers: Sequence[str] = DEFAULT_LAYERS,
+    layers: Sequence[str] = BUILDING_LAYERS,
     sheet: str | None = None,
     kind_column: str | None = None,
     floors_column: str | None = None,
@@ -556,7 +545,7 @@ def _kinds(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> NDArray[np
     if column is not None:
         for i, value in enumerate(frame[column].tolist()):
             text = "" if value is None or value != value else str(value).strip()
-            out[i] = _KINDS.get(text) or KIND_OF_LAYER.get(text.upper()) or text
+            out[i] = _KIND_OF_NAME.get(text) or BUILDING_KINDS.get(text.upper()) or text
     return out
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import logging
 import os
 import random
@@ -22,7 +21,6 @@ import re
 import sqlite3
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
@@ -36,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from brmgeo import files
 from brmgeo.errors import InputError, MissingInputError, NetworkError, SettingsError, WorkflowError
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.tilegrid import Tile, TileGrid, WebMercatorGrid
@@ -49,7 +48,6 @@ _MAX_TILE_BYTES = 16 << 20
 _RETRY_STATUS = {408, 425, 429, 500, 502, 503, 504}
 _ABSENT_STATUS = {204, 404, 410}
 _LONGEST_WAIT_S = 120.0
-_STALE_PART_S = 3600.0
 # A key typed into a URL would go into provenance: names of query parameters that carry one.
 _KEY_PARAMETER = re.compile(r"[?&](?:[\w-]*(?:key|token|secret|signature))=(?!\{key\})[^&{}]+", re.IGNORECASE)
 
@@ -414,9 +412,9 @@ def _missing_message(source: TileSource, missing: Sequence[Tile], wanted: int, o
 
 def _image_files(root: Path) -> Iterator[Path]:
     """Image files under a folder, in order of name within each folder."""
-    for folder, names, files in os.walk(root):
+    for folder, names, found in os.walk(root):
         names.sort()
-        for name in sorted(files):
+        for name in sorted(found):
             if name.rsplit(".", 1)[-1].lower() in EXTENSIONS:
                 yield Path(folder, name)
 
@@ -543,21 +541,15 @@ class _Download:
         mine = {"url_template": service.url_template, "grid": service.grid.name}
         try:
             service.cache_dir.mkdir(parents=True, exist_ok=True)
-            if record.is_file():
-                with contextlib.suppress(ValueError):
-                    other = json.loads(record.read_text(encoding="utf-8"))
-                    if other != mine:
-                        raise SettingsError(
-                            f"{service.cache_dir} keeps tiles of {other.get('url_template')}: give {service.url_template} "
-                            "a cache folder of its own"
-                        )
-            else:
-                _write_atomically(record, json.dumps(mine, indent=1).encode())
-            old = time.time() - _STALE_PART_S
-            for part in service.cache_dir.rglob("*.part"):
-                with contextlib.suppress(OSError):
-                    if part.stat().st_mtime < old:
-                        part.unlink()
+            other = files.read_json(record)
+            if other is not None and other != mine:
+                raise SettingsError(
+                    f"{service.cache_dir} keeps tiles of {other.get('url_template')}: give {service.url_template} "
+                    "a cache folder of its own"
+                )
+            if not record.is_file():
+                files.write_json(record, mine, durable=True)
+            files.clear_scratch(service.cache_dir, deep=True)
         except OSError as error:
             raise WorkflowError(
                 f"cannot write tile cache {service.cache_dir}: {error.strerror or error}"
@@ -566,6 +558,10 @@ class _Download:
     def _absent(self, tile: Tile) -> Path:
         """The marker of a tile that the service says does not exist."""
         return self.service.cache_dir / self.service.grid.path(tile, self.service.level, _ABSENT)
+
+    def _keep(self, path: Path, data: bytes) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.write_bytes(path, data, durable=True)
 
     def _tile(self, client: httpx.Client, tile: Tile, key: str) -> str | None:
         """Fetch and keep one tile. None when done, "" when stopped before it was asked for, else why it failed."""
@@ -583,7 +579,7 @@ class _Download:
             try:
                 data = self._get(client, url)
                 if data is None:
-                    _write_atomically(self._absent(tile), b"")
+                    self._keep(self._absent(tile), b"")
                     return None
                 try:
                     _, kind = decode_tile(data, service.grid.tile_px * service.pixel_ratio)
@@ -592,7 +588,7 @@ class _Download:
                         f"answered with something else: {error}".replace(key or "\0", "***")
                     ) from None
                 target = service.cache_dir / service.grid.path(tile, service.level, _FORMATS[kind])
-                _write_atomically(target, data)
+                self._keep(target, data)
                 return None
             except _TryAgainError as error:
                 if attempt == service.retries:
@@ -653,20 +649,6 @@ def _retry_after_s(value: str | None) -> float | None:
         return max(0.0, parsedate_to_datetime(value).timestamp() - time.time())
     except (TypeError, ValueError):
         return None
-
-
-def _write_atomically(path: Path, data: bytes) -> None:
-    """The file appears under its name with all its bytes, or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
-    try:
-        with open(part, "wb") as out:
-            out.write(data)
-            out.flush()
-            os.fsync(out.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from shapely import STRtree
 
-UNKNOWN = 255
-"""Mask value of a pixel outside all known areas."""
+from brmgeo.codes import UNKNOWN
 
 _STEPS = 1024  # positions per pixel, even: a pixel's centre is one of them
 _REACH_PX = 1_000_000  # products of two such distances in steps still fit 64 bits

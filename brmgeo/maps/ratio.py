@@ -43,12 +43,10 @@ import numpy as np
 from numba.core.compiler import Compiler
 from numpy.typing import NDArray
 
-NODATA = 65535
-"""Ratio value of a pixel whose disc holds no known pixel."""
-UNIT = 10_000
+from brmgeo.codes import RATIO_SCALE, RATIO_UNKNOWN, UNKNOWN
+
+UNIT = round(1 / RATIO_SCALE)
 """A ratio of one, in the units of ``ratio_maps``."""
-UNKNOWN = 255
-"""Mask value of a pixel of which nothing is known."""
 
 _LANES = 16  # pixels in a packed word
 _VECTOR = 32  # words; a strip is a multiple of it
@@ -382,7 +380,7 @@ def _divide(count: Any, known: Any, out: Any) -> None:
     for i in range(out.size):
         k = np.float64(known[i])
         ratio = (np.float64(count[i]) * UNIT + (0.5 * k + 0.25)) / max(k, 1.0)
-        out[i] = np.uint16(np.int32(ratio)) if k > 0.0 else np.uint16(NODATA)
+        out[i] = np.uint16(np.int32(ratio)) if k > 0.0 else np.uint16(RATIO_UNKNOWN)
 
 
 @_jit
@@ -550,29 +548,6 @@ def disc_counts(mask: NDArray[np.bool_] | NDArray[np.uint8], radius_px: float, *
     return cast(_Count, out)
 
 
-def ratio_maps_counts(
-    building: NDArray[np.uint8], radius_px: float, *, threads: int = 1
-) -> tuple[_Count, _Count]:
-    """Lossless ratios: (building pixels, known pixels) of the disc around every pixel.
-
-    Args:
-        building: (H, W) uint8: 1 building, 0 other, 255 unknown; everything outside the array is unknown.
-        radius_px: radius in pixels, above 0.
-        threads: number of threads to use.
-
-    Returns:
-        Two (H, W) arrays, dtype as in ``disc_counts``.
-
-    Raises:
-        ValueError: as ``ratio_maps``.
-    """
-    pixels, _ = _checked(building)
-    return (
-        disc_counts(pixels == 1, radius_px, threads=threads),
-        disc_counts(pixels != UNKNOWN, radius_px, threads=threads),
-    )
-
-
 def ratio_maps(
     building: NDArray[np.uint8],
     radii_px: Sequence[float],
@@ -590,7 +565,7 @@ def ratio_maps(
             which takes a fifth of the time.
 
     Returns:
-        (n, H, W) uint16 (``out`` where given) in units of 1e-4, rounded half up; NODATA (65 535) where no pixel of
+        (n, H, W) uint16 (``out`` where given) in units of 1e-4, rounded half up; RATIO_UNKNOWN (65 535) where no pixel of
         the disc is known. A block with ``halo_px(radius)`` more pixels on each side (or up to the edge of the
         whole) gives the whole map's values.
 
@@ -643,29 +618,6 @@ def ratio_maps(
     rows, cols = (1024, 2048) if some_unknown else (shape[0], _LANES * _STRIP_MAX)
     _each(work, _tiles(shape, min(rows, -(-shape[0] // max(threads, 1))), cols), threads)
     return maps
-
-
-def disc_radii(n: int, agl_m: float, fov_rad: float) -> NDArray[np.float64]:
-    """Radii in metres of the n discs of a view, eq. 3: r_k = (n + 1 - k) / n z tan(alpha / 2), k = 1..n.
-
-    Args:
-        n: number of discs, 1 or more.
-        agl_m: height z above ground, metres, above 0.
-        fov_rad: field of view alpha across the view's side, radians, in (0, pi).
-
-    Returns:
-        (n,) float64, largest first.
-
-    Raises:
-        ValueError: a number out of range.
-    """
-    if n < 1 or not (math.isfinite(agl_m) and agl_m > 0) or not 0 < fov_rad < math.pi:
-        raise ValueError(
-            f"{n} discs at {agl_m} m above ground and a field of view of {fov_rad} rad asked for: "
-            "give n >= 1, a height above 0 and an angle between 0 and pi"
-        )
-    k = np.arange(1, n + 1, dtype=np.float64)
-    return (n + 1 - k) / n * agl_m * math.tan(fov_rad / 2)
 
 
 def _checked(building: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], bool]:

@@ -27,6 +27,7 @@ from odc.geo.geobox import GeoBox
 from brmgeo.geo.crs import transformer
 from brmgeo.geo.grid import gsd_of
 from brmgeo.geo.tilegrid import KakaoGrid, Tile
+from brmgeo.pictures import encode
 from brmgeo.synth.scene import Building, Season, Town
 from brmgeo.synth.terrain import Waves
 
@@ -959,19 +960,6 @@ def render_imagery(town: Town, box: GeoBox, window_px: int = _WINDOW_PX) -> U8:
     return out
 
 
-def write_kakao_tiles(town: Town, out_dir: Path, level: int = 1, ext: str = "jpg", quality: int = 86) -> int:
-    """Writes ``out_dir``/L{z}/{y}/{x}.{ext}, every tile of Kakao's grid (EPSG:5181, y up) that ``town.bounds`` touches.
-
-    Painted straight in EPSG:5181, so the tiles are turned against the town's belt as real ones are. Returns the number of
-    tiles. Levels 1 (0.25 m) to 3 (1 m) make sense.
-    """
-    grid = KakaoGrid()
-    painter = Painter(town, grid.crs, grid.gsd_m(level))
-    return sum(
-        write_tiles(painter, block, out_dir, level, ext, quality) for block in tile_blocks(town, level)
-    )
-
-
 def tile_blocks(town: Town, level: int) -> list[list[Tile]]:
     """The tiles of Kakao's grid that ``town.bounds`` touches, in blocks that are painted in one go."""
     grid = KakaoGrid()
@@ -988,9 +976,6 @@ def write_tiles(
     """Paints and writes one of ``tile_blocks``, with a painter in the grid's CRS and at the level's GSD; their number."""
     grid = KakaoGrid()
     gsd, px = grid.gsd_m(level), grid.tile_px
-    options = (
-        [cv2.IMWRITE_JPEG_QUALITY, quality] if ext in ("jpg", "jpeg") else [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    )
     spans = [grid.tile_bounds(t, level) for t in block]
     left, top = min(s[0] for s in spans), max(s[3] for s in spans)
     right, bottom = max(s[2] for s in spans), min(s[1] for s in spans)
@@ -1000,9 +985,5 @@ def write_tiles(
         r, c = round((top - span[3]) / gsd), round((span[0] - left) / gsd)
         path = out_dir / grid.path(tile, level, ext)
         path.parent.mkdir(parents=True, exist_ok=True)
-        bgr = np.ascontiguousarray(patch[r : r + px, c : c + px, ::-1])
-        ok, data = cv2.imencode(f".{ext}", bgr, options)
-        if not ok:  # pragma: no cover - the encoder takes any uint8 picture
-            raise ValueError(f"cannot encode a tile as {ext!r}")
-        path.write_bytes(data.tobytes())
+        path.write_bytes(encode(patch[r : r + px, c : c + px], f".{ext}", quality=quality))
     return len(block)

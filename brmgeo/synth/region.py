@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-import hashlib
-import json
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from brmgeo import files
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.tilegrid import KakaoGrid
 from brmgeo.synth.imagery import Painter, tile_blocks, write_tiles
@@ -56,9 +55,7 @@ def write_region(
     parcel = out_dir / ".town.pickle"
     parcel.write_bytes(frozen)
     try:
-        work = functools.partial(
-            _write_part, out_dir, hashlib.sha256(frozen).hexdigest(), tuple(sheets), level
-        )
+        work = functools.partial(_write_part, out_dir, files.digest_of(frozen), tuple(sheets), level)
         # Sheets first: they are the longest jobs.
         jobs: list[tuple[str, int]] = [("sheet", i) for i in range(len(sheets))]
         jobs += [("tiles", k) for k in range(len(tile_blocks(town, level)))]
@@ -71,9 +68,7 @@ def write_region(
     manifest["buildings"] = len(town.buildings)
     manifest["area_m2"] = town.built_area_m2()
     manifest["tiles"] = sum(part["tiles"] for part in parts[len(sheets) :])
-    (out_dir / "manifest.json").write_text(
-        json.dumps(manifest, ensure_ascii=False, indent=1) + "\n", encoding="utf-8"
-    )
+    files.write_json(out_dir / "manifest.json", manifest)
     return manifest
 
 
@@ -92,7 +87,7 @@ def _write_part(
 def _town(path: Path, digest: str) -> Town:
     """The town in a file; ``digest`` tells apart two that lay at one path."""
     frozen = path.read_bytes()
-    assert hashlib.sha256(frozen).hexdigest() == digest
+    assert files.digest_of(frozen) == digest
     town = pickle.loads(frozen)
     assert isinstance(town, Town)
     return town

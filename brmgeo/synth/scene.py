@@ -14,6 +14,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 
+from brmgeo.codes import BUILDING_LAYERS
 from brmgeo.geo.grid import Bounds
 
 Season = Literal["spring", "summer", "autumn", "winter"]
@@ -21,20 +22,8 @@ Roof = Literal["flat", "hip", "gable", "shed", "metal", "apartment", "vinyl", "c
 RoadKind = Literal["arterial", "main", "street", "lane", "track"]
 Colour = tuple[int, int, int]
 
-# NGII's layer codes of building outlines (FACTS: 주택외건물, 주택, 연립주택, 공사중건물, 아파트, 무벽건물, 온실, 가건물).
-OTHER, HOUSE, ROW_HOUSE, UNDER_CONSTRUCTION = "B0014111", "B0014112", "B0014113", "B0014114"
-APARTMENT, CANOPY, GREENHOUSE, TEMPORARY = "B0014115", "B0014116", "B0014117", "B0014118"
-GROUP_BOUNDARY = "B0014119"
-BUILDING_LAYERS = (
-    OTHER,
-    HOUSE,
-    ROW_HOUSE,
-    UNDER_CONSTRUCTION,
-    APARTMENT,
-    CANOPY,
-    GREENHOUSE,
-    TEMPORARY,
-)
+# Names of NGII's layers of building outlines, in the order of their codes.
+OTHER, HOUSE, ROW_HOUSE, UNDER_CONSTRUCTION, APARTMENT, CANOPY, GREENHOUSE, TEMPORARY = BUILDING_LAYERS
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,12 +25,13 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from brmgeo.codes import BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, NEATLINE_LAYER
 from brmgeo.errors import SettingsError
 from brmgeo.geo.sheets import sheet_polygon
-from brmgeo.synth.scene import BUILDING_LAYERS, GROUP_BOUNDARY, Building, Town
+from brmgeo.synth.scene import Building, Town
 from brmgeo.synth.terrain import MILLIMETRE, polygons_of
 
-NEATLINE, NAME_LAYER = "H0017334", "H0049140"
+NAME_LAYER = "H0049140"
 GAP_M = 0.05
 # What is injected per sheet: (kind, how many). All change the drawing, not the buildings, unless said in the manifest.
 FAULTS: tuple[tuple[str, int], ...] = (
@@ -190,8 +191,8 @@ def _write_sheet(
 
     groups = [p for g in town.groups for p in polygons_of(g.intersection(sheet), 50.0)]
     for part in groups:
-        drawer.ring(np.asarray(part.exterior.coords)[:-1, :2], GROUP_BOUNDARY, True)
-    drawer.ring(np.asarray(sheet.exterior.coords)[:-1], NEATLINE, True)
+        drawer.ring(np.asarray(part.exterior.coords)[:-1, :2], GROUP_BOUNDARY_LAYER, True)
+    drawer.ring(np.asarray(sheet.exterior.coords)[:-1], NEATLINE_LAYER, True)
     symbols = _draw_symbols(drawer, [t for t, b, _ in clipped if b.polygon.area > 60], rng)
     _draw_texts(drawer, town, sheet, clipped)
     _draw_rest(drawer, town, sheet, rng)

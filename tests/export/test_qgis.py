@@ -14,12 +14,12 @@ import pyogrio
 import pytest
 from small_region import CRS, Region, flight, write_region
 
+from brmgeo.codes import BUILDING_KINDS
 from brmgeo.errors import CrsError, InputError
 from brmgeo.export import qgis_style
 from brmgeo.export.candidates import write_candidates
 from brmgeo.export.qgis import style_footprints, write_flight_project, write_maps_project
 from brmgeo.export.trajectory import Track, write_trajectory
-from brmgeo.ingest.dxf import KIND_OF_LAYER
 
 CHECK = Path(__file__).parents[1] / "qgis" / "check_qgis.py"
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -146,7 +146,7 @@ def test_the_vector_file_carries_the_styles_and_keeps_its_features(region: Regio
 def test_new_and_old_layer_codes_and_ingest_s_names_mean_the_same_kind(digit: str) -> None:
     assert qgis_style.kind_of(f"B001411{digit}") == qgis_style.kind_of(f"411{digit}")
     assert qgis_style.kind_of(f"411{digit}") is not None
-    assert qgis_style.kind_of(KIND_OF_LAYER[f"B001411{digit}"]) == qgis_style.kind_of(f"411{digit}")
+    assert qgis_style.kind_of(BUILDING_KINDS[f"B001411{digit}"]) == qgis_style.kind_of(f"411{digit}")
     assert qgis_style.kind_of("B0014119") is None
     assert qgis_style.kind_of("shed") is None
 

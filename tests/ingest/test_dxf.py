@@ -14,8 +14,9 @@ from ezdxf import path as ezpath
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from brmgeo.codes import BUILDING_LAYERS
 from brmgeo.errors import InputError, SettingsError
-from brmgeo.ingest.dxf import DEFAULT_LAYERS, flatten_bulges, read_dxf
+from brmgeo.ingest.dxf import flatten_bulges, read_dxf
 
 REAL = (
     Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[2] / "../shared/data")) / "ngii"
@@ -399,7 +400,7 @@ def with_ezdxf(path: Path) -> list[np.ndarray]:
     """Closed outlines as plain ezdxf reads them, arcs flattened finely."""
     rings = []
     for entity in ezdxf.readfile(path).modelspace():
-        if entity.dxf.layer not in DEFAULT_LAYERS or entity.dxftype() not in ("POLYLINE", "LWPOLYLINE"):
+        if entity.dxf.layer not in BUILDING_LAYERS or entity.dxftype() not in ("POLYLINE", "LWPOLYLINE"):
             continue
         rings.append(np.array([(v.x, v.y) for v in ezpath.make_path(entity).flattening(1e-4)]))
     return rings
@@ -415,7 +416,7 @@ def test_agrees_with_ezdxf(tmp_path, data, version):
         phi = np.arange(n) / n * math.tau
         bulges = data.draw(st.lists(st.sampled_from([0.0, 0.0, 0.1, -0.05]), min_size=n, max_size=n))
         xy = np.round(np.stack([radius * np.cos(phi), radius * np.sin(phi)], axis=1) + (40 * k, 0), 3)
-        sheet.ring(xy, layer=DEFAULT_LAYERS[data.draw(st.integers(0, 7))], bulges=bulges)
+        sheet.ring(xy, layer=BUILDING_LAYERS[data.draw(st.integers(0, 7))], bulges=bulges)
         sheet.ring(xy, layer="A0013111")
     path = sheet.save(tmp_path / "s.dxf")
     ours = read_dxf(path, sagitta_m=1e-4).footprints

@@ -22,6 +22,7 @@ import pytest
 from PIL import Image
 
 from brmgeo.errors import InputError, MissingInputError, NetworkError, SettingsError, WorkflowError
+from brmgeo.files import SCRATCH
 from brmgeo.geo.tilegrid import KakaoGrid, Tile, WebMercatorGrid
 from brmgeo.ingest.tiles import MBTiles, TileFolder, TileService, decode_tile, describe, ensure_tiles
 
@@ -61,7 +62,7 @@ def check_all(local: TileFolder) -> None:
 
 
 def left_overs(folder: Path) -> list[Path]:
-    return [p for p in folder.rglob("*") if p.name.endswith(".part")]
+    return [p for p in folder.rglob("*") if p.name.startswith(SCRATCH)]
 
 
 def test_download_is_complete_and_kept(tmp_path: Path) -> None:
@@ -258,14 +259,14 @@ ensure_tiles(source, tuple(map(float, bounds)), "EPSG:5181", margin_px=0,
                 if int(line) >= 4:
                     run.send_signal(signal.SIGKILL)
                     break
-        kept = list(tmp_path.rglob("*.png"))
+        kept = [p for p in tmp_path.rglob("*.png") if not p.name.startswith(SCRATCH)]
         assert 4 <= len(kept) < WANTED
         for path in kept:
             decode_tile(path.read_bytes(), 256)
         server.paths.clear()
         # A half tile of a killed writer: never under a tile's name, never taken for one.
         (tmp_path / "L3/1492").mkdir(parents=True, exist_ok=True)
-        orphan = tmp_path / "L3/1492/.2050.png.0123.part"
+        orphan = tmp_path / f"L3/1492/{SCRATCH}0123.png"
         orphan.write_bytes(tile_image("/x")[:50])
         os.utime(orphan, (1, 1))
         check_all(fill(source))

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from shapely import MultiPolygon, Polygon, STRtree
 
+from brmgeo.codes import UNKNOWN
 from brmgeo.geo.grid import Window, blocks, lattice, world_from_pixel
-from brmgeo.maps.rasterize import UNKNOWN, building_mask, known_mask, mask_window
+from brmgeo.maps.rasterize import building_mask, known_mask, mask_window
 
 REAL = Path(
     os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[2] / ".." / "shared" / "data")

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from brmgeo.maps.ratio import NODATA, UNKNOWN, disc_counts, disc_radii, halo_px, ratio_maps, ratio_maps_counts
+from brmgeo.codes import RATIO_UNKNOWN, UNKNOWN
+from brmgeo.maps.ratio import disc_counts, halo_px, ratio_maps
 
 
 def brute_counts(mask: NDArray[Any], radius: float) -> NDArray[np.int64]:
@@ -30,7 +31,7 @@ def brute_counts(mask: NDArray[Any], radius: float) -> NDArray[np.int64]:
 
 def brute_ratio(building: NDArray[np.uint8], radius: float) -> NDArray[np.int64]:
     count, known = brute_counts(building == 1, radius), brute_counts(building != UNKNOWN, radius)
-    return np.where(known > 0, (2 * count * 10_000 + known) // np.maximum(2 * known, 1), NODATA)
+    return np.where(known > 0, (2 * count * 10_000 + known) // np.maximum(2 * known, 1), RATIO_UNKNOWN)
 
 
 def fft_counts(mask: NDArray[np.bool_], radius: float) -> NDArray[np.int64]:
@@ -74,10 +75,7 @@ def test_ratios_equal_brute_force(building: NDArray[np.uint8], some_radii: list[
     assert maps.shape == (len(some_radii), *building.shape)
     for band, radius in zip(maps, some_radii, strict=True):
         np.testing.assert_array_equal(band, brute_ratio(building, radius))
-        count, known = ratio_maps_counts(building, radius)
-        np.testing.assert_array_equal(count, brute_counts(building == 1, radius))
-        np.testing.assert_array_equal(known, brute_counts(building != UNKNOWN, radius))
-        assert ((band <= 10_000) == (known > 0)).all()
+        assert ((band <= 10_000) == (brute_counts(building != UNKNOWN, radius) > 0)).all()
 
 
 @pytest.mark.parametrize("radius", [20.0, 39.4, 78.8, 118.2, 144.0])
@@ -113,7 +111,7 @@ def test_radius_beyond_the_mask_sees_all_of_it() -> None:
 
 def test_radius_below_one_pixel_is_the_pixel_itself() -> None:
     building = np.array([[0, 1, UNKNOWN]], np.uint8)
-    np.testing.assert_array_equal(ratio_maps(building, [0.3, 0.99]), [[[0, 10_000, NODATA]]] * 2)
+    np.testing.assert_array_equal(ratio_maps(building, [0.3, 0.99]), [[[0, 10_000, RATIO_UNKNOWN]]] * 2)
 
 
 def test_ratio_rounds_half_up_at_exact_ties() -> None:
@@ -163,7 +161,7 @@ def test_unknown_corner_in_a_map_of_many_tiles() -> None:
     maps = ratio_maps(building, [39.4, 20.0], threads=2)
     for band, radius in zip(maps, (39.4, 20.0), strict=True):
         count, known = fft_counts(building == 1, radius), fft_counts(building != UNKNOWN, radius)
-        want = np.where(known > 0, (2 * count * 10_000 + known) // np.maximum(2 * known, 1), NODATA)
+        want = np.where(known > 0, (2 * count * 10_000 + known) // np.maximum(2 * known, 1), RATIO_UNKNOWN)
         np.testing.assert_array_equal(band, want)
 
 
@@ -193,14 +191,6 @@ def test_halo_is_the_whole_pixels_of_the_radius() -> None:
     assert [halo_px(r) for r in (0.4, 1.0, 118.2, 144.9999)] == [0, 1, 118, 144]
 
 
-def test_disc_radii_follow_equation_3() -> None:
-    fov = np.deg2rad(43.0)
-    np.testing.assert_allclose(
-        disc_radii(3, 150.0, fov), 150.0 * np.tan(fov / 2) * np.array([1, 2 / 3, 1 / 3])
-    )
-    np.testing.assert_allclose(disc_radii(3, 150.0, fov) / 0.5, [118.2, 78.8, 39.4], atol=0.06)
-
-
 @pytest.mark.parametrize("radius", [0.0, -1.0, float("nan"), float("inf"), 1e6])
 def test_a_radius_out_of_range_is_refused(radius: float) -> None:
     with pytest.raises(ValueError, match="radius"):
@@ -219,8 +209,6 @@ def test_a_radius_out_of_range_is_refused(radius: float) -> None:
         (lambda: disc_counts(np.zeros((3, 3), np.float32), 1.0), "float32"),
         (lambda: disc_counts(np.zeros((3, 3), np.uint8), 1.0, threads=0), "threads"),
         (lambda: ratio_maps(np.zeros((3, 3), np.uint8), [1.0], out=np.zeros((1, 3, 4), np.uint16)), "out"),
-        (lambda: disc_radii(0, 150.0, 0.7), "0 discs"),
-        (lambda: disc_radii(3, -5.0, 0.7), "-5.0 m"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused(call: Any, found: str) -> None:

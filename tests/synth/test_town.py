@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import shapely
 
+from brmgeo.codes import BUILDING_LAYERS
 from brmgeo.errors import SettingsError
-from brmgeo.synth.scene import APARTMENT, BUILDING_LAYERS, CANOPY, HOUSE, Town, TownStyle
+from brmgeo.synth.scene import APARTMENT, CANOPY, HOUSE, Town, TownStyle
 from brmgeo.synth.town import generate_town
 
 BOUNDS = (195200.0, 446000.0, 195800.0, 446600.0)

@@ -12,7 +12,8 @@ from pyproj import Transformer
 from rasterio.features import rasterize
 
 from brmgeo.geo.grid import Window, lattice
-from brmgeo.synth.imagery import render_imagery, write_kakao_tiles
+from brmgeo.geo.tilegrid import KakaoGrid
+from brmgeo.synth.imagery import Painter, render_imagery, tile_blocks, write_tiles
 from brmgeo.synth.scene import Town, TownStyle
 from brmgeo.synth.town import generate_town
 
@@ -77,7 +78,8 @@ def test_shadows_fall_away_from_the_sun() -> None:
 
 
 def test_tiles_cover_the_bounds_and_are_turned(tmp_path: Path) -> None:
-    count = write_kakao_tiles(town(), tmp_path, level=2, ext="png")
+    painter = Painter(town(), KakaoGrid().crs, KakaoGrid().gsd_m(2))
+    count = sum(write_tiles(painter, block, tmp_path, 2, ext="png") for block in tile_blocks(town(), 2))
     paths = list(tmp_path.glob("L2/*/*.png"))
     assert len(paths) == count
     left, bottom, right, top = BOUNDS
