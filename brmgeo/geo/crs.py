@@ -7,7 +7,6 @@ declare northing first, and that must be forgotten in one place only.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 from pyproj import CRS, Proj, Transformer
@@ -19,58 +18,18 @@ from brmgeo.geo.grid import Bounds
 LONLAT = "EPSG:4326"
 
 
-@dataclass(frozen=True, slots=True)
-class Belt:
-    """One projected CRS that Korean maps come in.
+# The belts that NGII delivers in, each with the eastern end of its longitudes, degrees; the first begins at 123.
+_DELIVERED = (("EPSG:5185", 126.0), ("EPSG:5186", 128.0), ("EPSG:5187", 130.0), ("EPSG:5188", 133.0))
+_WEST_LON = 123.0
 
-    Attributes:
-        crs: code, for example "EPSG:5187".
-        name: EPSG's name without the datum.
-        datum: "GRS80" (Korea 2000 / KGD2002, within centimetres of WGS84) or "Bessel" (Korean 1985, some 300 m away).
-        lon0_deg: longitude of natural origin, degrees.
-        false_easting_m, false_northing_m: metres.
-        lon_range: (west, east) degrees in which NGII uses the belt.
-    """
-
-    crs: str
-    name: str
-    datum: str
-    lon0_deg: float
-    false_easting_m: float
-    false_northing_m: float
-    lon_range: tuple[float, float]
-
-
-_WEST, _CENTRAL, _EAST, _SEA, _ALL = (
-    (123.0, 126.0),
-    (126.0, 128.0),
-    (128.0, 130.0),
-    (130.0, 133.0),
-    (123.0, 133.0),
-)
-# The modified Bessel belts carry the 10.405" by which the old datum's longitudes were off.
-_MODIFIED = 10.405 / 3600.0
-
-BELTS: tuple[Belt, ...] = (
-    Belt("EPSG:5185", "West Belt 2010", "GRS80", 125.0, 200e3, 600e3, _WEST),
-    Belt("EPSG:5186", "Central Belt 2010", "GRS80", 127.0, 200e3, 600e3, _CENTRAL),
-    Belt("EPSG:5187", "East Belt 2010", "GRS80", 129.0, 200e3, 600e3, _EAST),
-    Belt("EPSG:5188", "East Sea Belt 2010", "GRS80", 131.0, 200e3, 600e3, _SEA),
-    Belt("EPSG:5179", "Unified CS (UTM-K)", "GRS80", 127.5, 1e6, 2e6, _ALL),
-    Belt("EPSG:5180", "West Belt", "GRS80", 125.0, 200e3, 500e3, _WEST),
-    Belt("EPSG:5181", "Central Belt", "GRS80", 127.0, 200e3, 500e3, _CENTRAL),
-    Belt("EPSG:5182", "Central Belt Jeju", "GRS80", 127.0, 200e3, 550e3, _CENTRAL),
-    Belt("EPSG:5183", "East Belt", "GRS80", 129.0, 200e3, 500e3, _EAST),
-    Belt("EPSG:5184", "East Sea Belt", "GRS80", 131.0, 200e3, 500e3, _SEA),
-    Belt("EPSG:5173", "Modified West Belt", "Bessel", 125.0 + _MODIFIED, 200e3, 500e3, _WEST),
-    Belt("EPSG:5174", "Modified Central Belt", "Bessel", 127.0 + _MODIFIED, 200e3, 500e3, _CENTRAL),
-    Belt("EPSG:5175", "Modified Central Belt Jeju", "Bessel", 127.0 + _MODIFIED, 200e3, 550e3, _CENTRAL),
-    Belt("EPSG:5176", "Modified East Belt", "Bessel", 129.0 + _MODIFIED, 200e3, 500e3, _EAST),
-    Belt("EPSG:5177", "Modified East Sea Belt", "Bessel", 131.0 + _MODIFIED, 200e3, 500e3, _SEA),
-    Belt("EPSG:2098", "West Belt (unmodified)", "Bessel", 125.0, 200e3, 500e3, _WEST),
-    Belt("EPSG:2097", "Central Belt (unmodified)", "Bessel", 127.0, 200e3, 500e3, _CENTRAL),
-    Belt("EPSG:2096", "East Belt (unmodified)", "Bessel", 129.0, 200e3, 500e3, _EAST),
-    Belt("EPSG:5178", "Unified CS", "Bessel", 127.5, 1e6, 2e6, _ALL),
+#: Projected CRSs that Korean maps come in, likelier ones first.
+BELTS = (
+    # Korea 2000 / KGD2002 on GRS80, within centimetres of WGS84: the belts of 2010, the unified CS, the belts before.
+    *(crs for crs, _ in _DELIVERED),
+    *("EPSG:5179", "EPSG:5180", "EPSG:5181", "EPSG:5182", "EPSG:5183", "EPSG:5184"),
+    # Korean 1985 on Bessel, some 300 m away: the belts modified by 10.405", those without, the unified CS.
+    *("EPSG:5173", "EPSG:5174", "EPSG:5175", "EPSG:5176", "EPSG:5177"),
+    *("EPSG:2098", "EPSG:2097", "EPSG:2096", "EPSG:5178"),
 )
 
 
@@ -129,24 +88,25 @@ def belt_for_sheet(number: str) -> str:
     """The GRS80 belt ("EPSG:5185" to "EPSG:5188") that NGII delivers a sheet in: its third digit decides."""
     if len(number) < 3 or not number.isascii() or not number.isdigit():
         raise CrsError(f"{number!r} is not a sheet number: give 5 to 9 digits, such as 36914093")
-    lon = _WEST[0] + (int(number[2]) - 3) % 10
+    lon = _WEST_LON + (int(number[2]) - 3) % 10
     return belt_for_lon(lon + 0.5)
 
 
 def belt_for_lon(lon_deg: float) -> str:
     """The GRS80 belt ("EPSG:5185" to "EPSG:5188") at a longitude in degrees. Raises CrsError outside 123-133 E."""
-    for belt in BELTS[:4]:
-        if belt.lon_range[0] <= lon_deg < belt.lon_range[1]:
-            return belt.crs
+    if lon_deg >= _WEST_LON:
+        for crs, east in _DELIVERED:
+            if lon_deg < east:
+                return crs
     raise CrsError(
         f"longitude {lon_deg:.4f} lies outside the Korean belts (123-133 E): state the crs yourself"
     )
 
 
-def belt(crs: str) -> Belt | None:
-    """The Korean belt that ``crs`` is, or None."""
-    code = crs_name(crs)
-    return next((b for b in BELTS if b.crs == code), None)
+def on_old_datum(crs: str) -> bool:
+    """Whether ``crs`` is a Korean belt on the old datum (Korean 1985, Bessel), some 300 m away from today's."""
+    ellipsoid = parse_crs(crs).ellipsoid
+    return crs_name(crs) in BELTS and ellipsoid is not None and ellipsoid.name == "Bessel 1841"
 
 
 def convergence_rad(crs: str, x: float, y: float) -> float:

@@ -11,9 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from affine import Affine
-from numpy.typing import NDArray
 
 from brmgeo.errors import SettingsError
 
@@ -63,20 +61,6 @@ def shape_of(box: GeoBox) -> tuple[int, int]:
 def gsd_of(box: GeoBox) -> float:
     """Metres per pixel of a lattice."""
     return float(box.affine.a)
-
-
-def pixel_from_world(box: GeoBox, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 2) float64 (row, col) in the edge convention from (n, 2) float64 world (x, y)."""
-    a = box.affine
-    xy = np.asarray(xy, dtype=np.float64)
-    return np.stack([(xy[..., 1] - a.f) / a.e, (xy[..., 0] - a.c) / a.a], axis=-1)
-
-
-def world_from_pixel(box: GeoBox, rc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 2) float64 world (x, y) from (n, 2) float64 (row, col) in the edge convention."""
-    a = box.affine
-    rc = np.asarray(rc, dtype=np.float64)
-    return np.stack([a.c + rc[..., 1] * a.a, a.f + rc[..., 0] * a.e], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)

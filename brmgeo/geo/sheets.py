@@ -34,8 +34,8 @@ from brmgeo.errors import CrsError, InputError
 from brmgeo.geo.crs import (
     BELTS,
     LONLAT,
-    belt,
     crs_name,
+    on_old_datum,
     parse_crs,
     require_projected_metres,
     same_crs,
@@ -177,10 +177,10 @@ def check_extent(
         return stated
     fits: list[tuple[float, int, str]] = []
     for order, candidate in enumerate(BELTS):
-        for bessel in _graticules(candidate.crs):
-            misfit = _misfit(extent, candidate.crs, sheets, bessel, neatline)
+        for bessel in _graticules(candidate):
+            misfit = _misfit(extent, candidate, sheets, bessel, neatline)
             if misfit <= tolerance_m:
-                fits.append((misfit if neatline else 0.0, order, candidate.crs))
+                fits.append((misfit if neatline else 0.0, order, candidate))
     place = f"{what}: coordinates lie {_distance(stated)} from sheet {_listed(sheets)} when read as {crs_name(crs)}"
     if not fits:
         left, bottom, right, top = extent
@@ -226,8 +226,7 @@ def _misfit(extent: Bounds, crs: str, sheets: Sequence[str], bessel: bool, neatl
 
 def _graticules(crs: str) -> tuple[bool, ...]:
     """On the old datum a sheet may be cut along old longitudes (made so) or new ones (transformed later)."""
-    found = belt(crs)
-    return (True, False) if found is not None and found.datum == "Bessel" else (False,)
+    return (True, False) if on_old_datum(crs) else (False,)
 
 
 def _distance_between(extent: Bounds, a: str, b: str) -> float:

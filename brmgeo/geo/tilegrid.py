@@ -6,7 +6,7 @@ Two grids cover what a user in Korea meets:
   L1 (0.25 m) to L14, x to the east, y UP, path ``L{z}/{y}/{x}``. Its tiles are turned against the east-belt sheets of
   NGII by about 1.2 degrees, so imagery is reprojected, never only shifted.
 - ``WebMercatorGrid``: EPSG:3857, the XYZ scheme of OpenStreetMap, VWorld and most services (y DOWN, path
-  ``{z}/{x}/{y}``), with the numbers of morecantile's WebMercatorQuad; ``tms=True`` counts y from the south instead,
+  ``{z}/{x}/{y}``), OGC's WebMercatorQuad; ``tms=True`` counts y from the south instead,
   as MBTiles and TMS servers do.
 
 A tile is a ``Tile(x, y)`` of a level z. Bounds are (left, bottom, right, top) in the grid's own CRS.
@@ -22,12 +22,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
-import morecantile
 import numpy as np
 import shapely
 
 from brmgeo.errors import CrsError, SettingsError
-from brmgeo.geo.crs import transformer
+from brmgeo.geo.crs import parse_crs, transformer
 from brmgeo.geo.grid import Bounds
 
 TILE_PX = 256
@@ -75,41 +74,12 @@ class TileGrid(ABC):
     def _count(self, z: int) -> tuple[int, int]:
         """Number of tiles (columns, rows) at level z."""
 
-    @abstractmethod
-    def ground_gsd_m(self, z: int, lat_deg: float) -> float:
-        """Ground metres per pixel at level z and latitude ``lat_deg`` (degrees)."""
-
     def check_level(self, z: int) -> None:
         """Raises SettingsError unless z is a level of this grid."""
         if not self.min_level <= z <= self.max_level:
             raise SettingsError(
                 f"tile level {z} does not exist in the {self.name} grid: give {self.min_level} to {self.max_level}"
             )
-
-    def level_for(self, gsd_m: float, lat_deg: float) -> int:
-        """The coarsest level whose ground pixels at ``lat_deg`` are no larger than ``gsd_m``, else the finest one."""
-        levels = range(self.min_level, self.max_level + 1)
-        fine = [z for z in levels if self.ground_gsd_m(z, lat_deg) <= gsd_m * (1 + 1e-9)]
-        pool = fine or list(levels)
-        key = {z: self.ground_gsd_m(z, lat_deg) for z in pool}
-        return max(pool, key=key.__getitem__) if fine else min(pool, key=key.__getitem__)
-
-    def tile_at(self, x: float, y: float, z: int) -> Tile:
-        """The tile at level z that holds the point (x, y) of the grid's CRS (metres).
-
-        A tile owns its left edge and the edge from which y is counted. Raises CrsError outside the grid.
-        """
-        span = self.gsd_m(z) * self.tile_px
-        ox, oy = self._origin(z)
-        if not (math.isfinite(x) and math.isfinite(y)):
-            raise CrsError(f"point ({x}, {y}) is not in {self.crs}: the {self.name} grid has no tile there")
-        tile = Tile(math.floor((x - ox) / span), math.floor((y - oy if self.y_up else oy - y) / span))
-        columns, rows = self._count(z)
-        if not (0 <= tile.x < columns and 0 <= tile.y < rows):
-            raise CrsError(
-                f"point ({x:.1f}, {y:.1f}) in {self.crs} lies outside the {self.name} tile grid: check the region's CRS"
-            )
-        return tile
 
     def tile_bounds(self, tile: tuple[int, int], z: int) -> Bounds:
         """(left, bottom, right, top) of a tile in the grid's CRS, metres."""
@@ -240,9 +210,6 @@ class KakaoGrid(TileGrid):
         self.check_level(z)
         return 2.0 ** (z - 3)
 
-    def ground_gsd_m(self, z: int, lat_deg: float) -> float:
-        return self.gsd_m(z)
-
     def _origin(self, z: int) -> tuple[float, float]:
         return (-30000.0, -60000.0)
 
@@ -254,7 +221,7 @@ class KakaoGrid(TileGrid):
 
 @dataclass(frozen=True)
 class WebMercatorGrid(TileGrid):
-    """The XYZ grid in EPSG:3857 (morecantile's WebMercatorQuad); ``tms=True`` counts y from the south."""
+    """The XYZ grid in EPSG:3857 (OGC's WebMercatorQuad); ``tms=True`` counts y from the south."""
 
     tms: bool = False
 
@@ -269,15 +236,12 @@ class WebMercatorGrid(TileGrid):
         return self.tms
 
     def gsd_m(self, z: int) -> float:
-        return _mercator_matrix(self, z)[0]
-
-    def ground_gsd_m(self, z: int, lat_deg: float) -> float:
-        # The scale of the Mercator projection on the sphere, as every tile service states it.
-        return self.gsd_m(z) * math.cos(math.radians(lat_deg))
+        self.check_level(z)
+        return 2.0 * _mercator_half_m() / self.tile_px / 2.0**z
 
     def _origin(self, z: int) -> tuple[float, float]:
-        _, left, top = _mercator_matrix(self, z)
-        return (left, -top if self.tms else top)
+        half = _mercator_half_m()
+        return (-half, -half if self.tms else half)
 
     def _count(self, z: int) -> tuple[int, int]:
         return 1 << z, 1 << z
@@ -296,13 +260,12 @@ def grid_named(name: str) -> TileGrid:
     return grids[name]
 
 
-@lru_cache(maxsize=32)
-def _mercator_matrix(grid: WebMercatorGrid, z: int) -> tuple[float, float, float]:
-    """(pixel size, left, top) of a level of WebMercatorQuad, metres."""
-    grid.check_level(z)
-    matrix = morecantile.tms.get("WebMercatorQuad").matrix(z)
-    left, top = matrix.pointOfOrigin
-    return float(matrix.cellSize), float(left), float(top)
+@lru_cache(maxsize=1)
+def _mercator_half_m() -> float:
+    """Half the side of the square that web mercator maps the earth to, metres."""
+    ellipsoid = parse_crs("EPSG:3857").ellipsoid
+    assert ellipsoid is not None
+    return math.pi * float(ellipsoid.semi_major_metre)
 
 
 @lru_cache(maxsize=32)

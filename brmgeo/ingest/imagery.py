@@ -20,7 +20,7 @@ import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -41,7 +41,7 @@ from brmgeo.geo.crs import belt_for_sheet, crs_name, parse_crs, same_crs, transf
 from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import Tile
-from brmgeo.ingest.tiles import TileService, TileSource, describe
+from brmgeo.ingest.tiles import TileSource
 
 _CELL_PX = 32
 # The largest piece of a source that is held at once, pixels a side.
@@ -163,32 +163,6 @@ def native_gsd_m(sources: Sequence[ImagerySource], box: GeoBox) -> float:
         with _plane_of(source) as plane:
             found = max(found, gsd_of(box) / max(min(_scale(plane, box)), 1e-12))
     return found
-
-
-def imagery_credits(sources: Sequence[ImagerySource | TileService]) -> tuple[str, str]:
-    """(attribution, terms) of all sources, each said once: what the outputs' metadata must carry."""
-    return (
-        "; ".join(dict.fromkeys(s.attribution for s in sources if s.attribution)),
-        "; ".join(dict.fromkeys(s.terms for s in sources if s.terms)),
-    )
-
-
-def describe_imagery(source: ImagerySource | TileService) -> dict[str, object]:
-    """What provenance keeps of a source, as plain values; never a key."""
-    if not isinstance(source, (GeoRaster, NgiiOrtho)):
-        return dict(describe(source))
-    facts = {name: value for name, value in asdict(source).items() if value not in (None, "")}
-    return {**facts, "path": str(source.path)}
-
-
-def source_files(source: ImagerySource, tiles: Sequence[Tile] = ()) -> list[Path]:
-    """The files that a source consists of (of a tile folder, those of ``tiles``), for keys and provenance."""
-    if isinstance(source, (GeoRaster, NgiiOrtho)):
-        beside = [p for p in sorted(source.path.parent.glob(f"{source.path.stem}.*")) if _is_world_file(p)]
-        return [source.path, *beside]
-    if hasattr(source, "file"):
-        return [path for path in (source.file(tile) for tile in tiles) if path is not None]
-    return [source.path] if hasattr(source, "path") else []
 
 
 class _Plane(Protocol):
@@ -592,9 +566,3 @@ def _sample(  # type: ignore[no-untyped-def]  # pragma: no cover
                 value = math.floor(total[band] / weight + 0.5)
                 out[i, j, band] = np.uint8(min(255.0, max(0.0, value)))
             out_valid[i, j] = True
-
-
-def _is_world_file(path: Path) -> bool:
-    """Whether a file is a world file by its extension: tfw, jgw, pgw, wld, or the image's own with a w."""
-    ext = path.suffix.lower().lstrip(".")
-    return ext == "wld" or (ext.endswith("w") and len(ext) in (3, 4, 5) and ext != "raw")

@@ -363,19 +363,6 @@ def decode_tile(data: bytes, size_px: int) -> tuple[NDArray[np.uint8], str]:
         raise ValueError(f"the image is damaged ({error})") from None
 
 
-def describe(source: TileSource | TileService) -> dict[str, str | int | float]:
-    """What provenance keeps of a source: its place, grid, level, attribution and terms; never a key."""
-    return {
-        "source": source.url_template if isinstance(source, TileService) else source.where,
-        "grid": source.grid.name,
-        "crs": source.grid.crs,
-        "level": source.level,
-        "pixel_ratio": source.pixel_ratio,
-        "attribution": source.attribution,
-        "terms": source.terms,
-    }
-
-
 def _missing_message(source: TileSource, missing: Sequence[Tile], wanted: int, origin: str) -> str:
     """One line: how many, which, where they go, where a person gets them, and what is there instead."""
     grid, z = source.grid, source.level

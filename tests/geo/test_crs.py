@@ -17,6 +17,7 @@ from brmgeo.geo.crs import (
     belt_for_sheet,
     convergence_rad,
     crs_name,
+    on_old_datum,
     require_projected_metres,
     same_crs,
     transform_bounds,
@@ -24,14 +25,16 @@ from brmgeo.geo.crs import (
 )
 
 
-@pytest.mark.parametrize("belt", BELTS, ids=lambda belt: belt.crs)
-def test_the_table_of_belts_says_what_epsg_says(belt):
-    crs = CRS(belt.crs)
-    params = {p.name: p.value for p in crs.coordinate_operation.params}
-    assert params["Longitude of natural origin"] == pytest.approx(belt.lon0_deg, abs=1e-9)
-    assert params["False easting"] == belt.false_easting_m
-    assert params["False northing"] == belt.false_northing_m
-    assert ("Bessel" in crs.ellipsoid.name) == (belt.datum == "Bessel")
+@pytest.mark.parametrize("code", BELTS)
+def test_the_belts_are_korean_and_lie_on_the_datum_that_they_are_said_to(code):
+    crs = CRS(code)
+    assert crs.name.startswith(("KGD2002 / ", "Korea 2000 / ", "Korean 1985 / "))
+    assert on_old_datum(code) == crs.name.startswith("Korean 1985")
+    assert on_old_datum(code) == (crs.geodetic_crs.name == "Korean 1985")
+    lon0 = next(p.value for p in crs.coordinate_operation.params if p.name == "Longitude of natural origin")
+    assert 125.0 <= lon0 <= 131.1
+    if BELTS.index(code) < 4:
+        assert belt_for_lon(lon0) == code
 
 
 def test_kakao_check_value():

@@ -24,7 +24,7 @@ from PIL import Image
 from brmgeo.errors import InputError, MissingInputError, NetworkError, SettingsError, WorkflowError
 from brmgeo.files import SCRATCH
 from brmgeo.geo.tilegrid import KakaoGrid, Tile, WebMercatorGrid
-from brmgeo.ingest.tiles import MBTiles, TileFolder, TileService, decode_tile, describe, ensure_tiles
+from brmgeo.ingest.tiles import MBTiles, TileFolder, TileService, decode_tile, ensure_tiles
 
 sys.path.insert(0, str(Path(__file__).parent))
 from tile_server import TileServer, tile_image, tile_server
@@ -209,8 +209,6 @@ def test_the_key_stays_secret(
         shown += [
             repr(source),
             repr(local),
-            str(describe(source)),
-            str(describe(local)),
             repr(pickle.dumps(source)),
         ]
         for n, fault in enumerate(("drop", "junk", "500", "403", "stall")):

@@ -18,7 +18,7 @@ from odc.geo.geobox import GeoBox
 from shapely import MultiPolygon, Polygon, STRtree
 
 from brmgeo.codes import UNKNOWN
-from brmgeo.geo.grid import Window, blocks, lattice, world_from_pixel
+from brmgeo.geo.grid import Window, blocks, lattice
 from brmgeo.maps.rasterize import building_mask, known_mask, mask_window
 
 REAL = Path(
@@ -34,6 +34,12 @@ def town_box(gsd_m: float) -> GeoBox:
     """A lattice far from the origin, where floating point hurts."""
     left, bottom = round(351_752.0 / gsd_m) * gsd_m, round(464_764.0 / gsd_m) * gsd_m
     return lattice((left, bottom, left + SIZE * gsd_m, bottom + SIZE * gsd_m), "EPSG:5181", gsd_m)
+
+
+def world_from_pixel(box: GeoBox, rc: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World (x, y) of (row, col), pixel edges at whole numbers."""
+    a = box.affine
+    return np.stack([a.c + rc[..., 1] * a.a, a.f + rc[..., 0] * a.e], axis=-1)
 
 
 def centres(box: GeoBox) -> NDArray[np.float64]:
