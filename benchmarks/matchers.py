@@ -117,7 +117,7 @@ def large(method: str, ground: GroundMap, flight: SimulatedViews, side_km: float
 
 def fly(method: str, ground: GroundMap, flight: SimulatedViews) -> dict[str, Any]:
     """One flight through one matcher."""
-    matcher = make_matcher(method, ground)
+    matcher = make_matcher(method, ground, history=True)
     xy = flight.reference.xy_m
     flown = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     fixed, error, sigma, wall = [], [], [], []

@@ -36,7 +36,7 @@ def locate(
     settings: MatchSettings,
 ) -> Located:
     """Runs a matcher over a flight's views, live, and smooths at the end."""
-    matcher = make_matcher(method, ground, settings)
+    matcher = make_matcher(method, ground, settings, history=True)
     estimates, seconds = [], []
     for view, motion in zip(views, steps, strict=True):
         start = time.perf_counter()

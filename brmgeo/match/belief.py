@@ -14,202 +14,29 @@ odometry step turned into that heading and blurs them; mass that leaves the grid
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
-from brmgeo.maps.ratio import Disjoint
+from brmgeo.match.kernels import (
+    BLOCK,
+    entropy_of,
+    factor_of,
+    mass_of,
+    mix_headings,
+    move_blocks,
+    step_kernels,
+)
 from brmgeo.match.settings import BeliefSettings
+from brmgeo.match.state import State, damaged
 from brmgeo.match.threads import split
 
-BLOCK = 16
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, pipeline_class=Disjoint)
-def _convolve(window, half, kx, ky, out):  # type: ignore[no-untyped-def]
-    """out (256,) = a window of (15 + taps) x (15 + taps) cells, flat, through kx along rows, then ky; half is scratch.
-
-    Positions are unsigned: signed ones would be tested for counting from the end, and the loops not be vectorised.
-    """
-    last = np.uint64(len(kx) - 1)
-    side = np.uint64(BLOCK) + last
-    for i in range(side):
-        p, q = np.uint64(i) * side + last, np.uint64(i * BLOCK)
-        for j in range(BLOCK):
-            half[q + np.uint64(j)] = 0.0
-        for v in range(len(kx)):
-            k, first = kx[v], p - np.uint64(v)
-            for j in range(BLOCK):
-                half[q + np.uint64(j)] += k * window[first + np.uint64(j)]
-    for i in range(BLOCK):
-        p, q = np.uint64(i) + last, np.uint64(i * BLOCK)
-        for j in range(BLOCK):
-            out[q + np.uint64(j)] = 0.0
-        for u in range(len(ky)):
-            k, first = ky[u], (p - np.uint64(u)) * np.uint64(BLOCK)
-            for j in range(BLOCK):
-                out[q + np.uint64(j)] += k * half[first + np.uint64(j)]
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _move(blocks, index, targets, whole, ky, kx, reach, ny, nx, out, t0, t1):  # type: ignore[no-untyped-def]
-    """Each target block gathered from its sources: whole-cell shift, then a separable kernel of 2 reach + 1 taps."""
-    side = BLOCK + 2 * reach
-    nby, nbx = index.shape[1], index.shape[2]
-    window, half = np.empty(side * side, np.float32), np.empty(side * BLOCK, np.float32)
-    for t in range(t0, t1):
-        h, by, bx = targets[t, 0], targets[t, 1], targets[t, 2]
-        top = by * BLOCK - reach - whole[h, 0]
-        left = bx * BLOCK - reach - whole[h, 1]
-        window[:] = 0.0
-        for sy in range(max(0, top // BLOCK), min(nby - 1, (top + side - 1) // BLOCK) + 1):
-            for sx in range(max(0, left // BLOCK), min(nbx - 1, (left + side - 1) // BLOCK) + 1):
-                s = index[h, sy, sx]
-                if s < 0:
-                    continue
-                i0, i1 = max(top, sy * BLOCK), min(top + side, sy * BLOCK + BLOCK)
-                j0, j1 = max(left, sx * BLOCK), min(left + side, sx * BLOCK + BLOCK)
-                for i in range(i0, i1):
-                    source = blocks[s, i - sy * BLOCK, j0 - sx * BLOCK : j1 - sx * BLOCK]
-                    first = (i - top) * side + j0 - left
-                    window[first : first + j1 - j0] = source
-        _convolve(window, half, kx[h], ky[h], out[t].reshape(BLOCK * BLOCK))
-        if (by + 1) * BLOCK > ny or (bx + 1) * BLOCK > nx:
-            for i in range(BLOCK):
-                for j in range(BLOCK):
-                    if by * BLOCK + i >= ny or bx * BLOCK + j >= nx:
-                        out[t, i, j] = 0.0
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _mix(blocks, index, targets, share, out, t0, t1):  # type: ignore[no-untyped-def]
-    """Each target block takes ``share`` from both neighbouring headings and keeps the rest."""
-    headings = index.shape[0]
-    for t in range(t0, t1):
-        h, by, bx = targets[t, 0], targets[t, 1], targets[t, 2]
-        out[t] = 0.0
-        for d in range(-1, 2):
-            s = index[(h + d + headings) % headings, by, bx]
-            if s >= 0:
-                w = np.float32(share if d != 0 else 1.0 - 2.0 * share)
-                for i in range(BLOCK):
-                    for j in range(BLOCK):
-                        out[t, i, j] += w * blocks[s, i, j]
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _mass_of(blocks):  # type: ignore[no-untyped-def]
-    """(sum, maximum) of each block, float64."""
-    out = np.empty((blocks.shape[0], 2), np.float64)
-    for t in range(blocks.shape[0]):
-        total = np.float32(0.0)
-        top = np.float32(0.0)
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                v = blocks[t, i, j]
-                total += v
-                top = max(top, v)
-        out[t, 0] = total
-        out[t, 1] = top
-    return out
-
-
-def _factor(llr: F32, low: float, high: float, weight: float) -> F32:
-    """The bounded likelihood ratio, written over ``llr``: a frame is wrong as a whole with chance e^low."""
-    if weight != 1.0:
-        llr *= np.float32(weight)
-    np.minimum(llr, np.float32(high), out=llr)
-    np.exp(llr, out=llr)
-    llr += np.float32(math.exp(low))
-    return llr
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _search_heading(factor, listed, blocks, even, masses):  # type: ignore[no-untyped-def]
-    """Posterior mass of every block of one heading; ``listed`` (nby, nbx) holds the row of a listed block or -1.
-
-    ``even`` is the prior mass per cell of ``rest``.
-    """
-    ny, nx = factor.shape
-    for by in range(listed.shape[0]):
-        for bx in range(listed.shape[1]):
-            s = listed[by, bx]
-            total = np.float32(0.0)
-            wide = min(BLOCK, nx - bx * BLOCK)
-            for i in range(min(BLOCK, ny - by * BLOCK)):
-                row = factor[by * BLOCK + i, bx * BLOCK : bx * BLOCK + wide]
-                if s >= 0:
-                    for j in range(wide):
-                        total += (even + blocks[s, i, j]) * row[j]
-                else:
-                    for j in range(wide):
-                        total += even * row[j]
-            masses[by, bx] = total
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _take_blocks(factor, listed, blocks, even, cells, out):  # type: ignore[no-untyped-def]
-    """Posterior blocks at ``cells`` (n, 2) block row, block col."""
-    ny, nx = factor.shape
-    for n in range(cells.shape[0]):
-        by, bx = cells[n, 0], cells[n, 1]
-        s = listed[by, bx]
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                y, x = by * BLOCK + i, bx * BLOCK + j
-                v = np.float32(0.0)
-                if y < ny and x < nx:
-                    v = (even + blocks[s, i, j] if s >= 0 else even) * factor[y, x]
-                # Below this a cell weighs nothing even after the largest ratio; denormals would cost time.
-                out[n, i, j] = v if v > 1e-25 else np.float32(0.0)
-
-
-@nb.njit(cache=True, nogil=True)
-def _entropy(blocks):  # type: ignore[no-untyped-def]
-    total = 0.0
-    flat = blocks.reshape(-1)
-    for t in range(flat.shape[0]):
-        v = flat[t]
-        if v > 1e-12:
-            total -= v * math.log(v)
-    return total
-
-
-def _step_kernels(fraction: F64, sigma: float, reach: int) -> F32:
-    """(n, 2 reach + 1) weights of whole-cell offsets for normals of mean ``fraction`` and deviation ``sigma`` cells."""
-    edges = (np.arange(-reach, reach + 2) - 0.5 - fraction[:, None]) / (sigma * math.sqrt(2.0))
-    weights = np.diff(erf(edges), axis=1)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
-
-
-class Tiers(Protocol):
-    """A view's log-likelihood ratios over a whole map, coarse and fine; see ``Belief.search_tiers``.
-
-    Attributes:
-        group: how many neighbouring headings share a coarse one; it divides the number of headings.
-        scale: cells of the belief per coarse cell and axis, 1 or 2. A coarse block has 16 x 16 coarse cells.
-        places: (n, 2) int32 rows and columns of the coarse blocks worth scoring.
-        bound: (coarse block rows, coarse block cols) float32, upper bounds of the ratios in all others.
-    """
-
-    group: int
-    scale: int
-    places: NDArray[np.int32]
-    bound: F32
-
-    def rough(self, keys: NDArray[np.int32]) -> F32:
-        """(n, 16, 16) ratios on coarse cells for keys (group, coarse block row, coarse block col)."""
-
-    def fine(self, keys: NDArray[np.int32]) -> F32:
-        """(n, 16, 16) ratios for keys (heading, block row, block col)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +74,7 @@ class Belief:
         self.off = settings.off_map_start
         self.rest = 1.0 - settings.off_map_start
         self._spare = np.empty((0, BLOCK, BLOCK), np.float32)
-        self._even_block = 1.0 / float(self.headings * self.grid[0] * self.grid[1])
+        self.even_block = 1.0 / float(self.headings * self.grid[0] * self.grid[1])
 
     @property
     def cells(self) -> int:
@@ -262,7 +89,7 @@ class Belief:
         """Sum of everything; 1 up to rounding after each public call."""
         return float(self.blocks.sum(dtype=np.float64)) + self.rest + self.off
 
-    def _list(self, keys: NDArray[np.int32], blocks: F32) -> None:
+    def list_blocks(self, keys: NDArray[np.int32], blocks: F32) -> None:
         old = self.keys
         self.index[old[:, 0], old[:, 1], old[:, 2]] = -1
         self.keys, self.blocks = keys, blocks
@@ -277,24 +104,45 @@ class Belief:
     def _swap(self, keys: NDArray[np.int32], fresh: F32) -> None:
         """List blocks that were written into the buffer, and keep the old array as the next buffer."""
         old = self.blocks if self.blocks.base is None else self.blocks.base
-        self._list(keys, fresh)
+        self.list_blocks(keys, fresh)
         self._spare = old if old.ndim == 3 else np.empty((0, BLOCK, BLOCK), np.float32)
+
+    def state(self) -> State:
+        """Everything as named arrays, a copy."""
+        return {
+            "keys": self.keys.copy(),
+            "blocks": self.blocks.copy(),
+            "rest": np.array(self.rest),
+            "off": np.array(self.off),
+            "grid": np.array([self.headings, *self.shape], np.int64),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take up what ``state`` gave; InputError where it is of another grid or contradicts itself."""
+        keys, blocks = state["keys"], state["blocks"]
+        if state["grid"].tolist() != [self.headings, *self.shape]:
+            raise damaged(f"its belief is of {state['grid'].tolist()} headings and cells")
+        inside = ((keys >= 0) & (keys < self.index.shape)).all() and len(np.unique(keys, axis=0)) == len(keys)
+        if len(keys) != len(blocks) or not inside:
+            raise damaged("its belief lists blocks that are not there")
+        self.list_blocks(keys, blocks)
+        self.rest, self.off = float(state["rest"]), float(state["off"])
 
     def prune(self) -> None:
         """Unlist blocks that hold less than the settings' share of an even spread; their mass joins ``rest``."""
         if not len(self.keys):
             return
-        mass = _mass_of(self.blocks)[:, 0]
-        stay = mass > self.settings.keep * self._even_block
+        mass = mass_of(self.blocks)[:, 0]
+        stay = mass > self.settings.keep * self.even_block
         if stay.sum() > self.settings.max_blocks:
             limit = np.partition(mass, -self.settings.max_blocks)[-self.settings.max_blocks]
             stay = mass >= limit
         if stay.all():
             return
         self.rest += float(mass[~stay].sum())
-        self._list(self.keys[stay], self.blocks[stay])
+        self.list_blocks(self.keys[stay], self.blocks[stay])
 
-    def _normalise(self) -> float:
+    def normalise(self) -> float:
         total = self.total()
         self.blocks *= np.float32(1.0 / total)
         self.rest /= total
@@ -327,13 +175,13 @@ class Belief:
             whole = np.rint(moved).astype(np.int64)
             sigma = max(sigma, 0.4)
             reach = max(2, math.ceil(3.0 * sigma + 0.5))
-            ky = _step_kernels((moved - whole)[:, 0], sigma, reach)
-            kx = _step_kernels((moved - whole)[:, 1], sigma, reach)
+            ky = step_kernels((moved - whole)[:, 0], sigma, reach)
+            kx = step_kernels((moved - whole)[:, 1], sigma, reach)
             targets = self._reached(whole, reach)
             out = self._buffer(len(targets))
             blocks, index, shape = self.blocks, self.index, self.shape
             split(
-                lambda t0, t1: _move(blocks, index, targets, whole, ky, kx, reach, *shape, out, t0, t1),
+                lambda t0, t1: move_blocks(blocks, index, targets, whole, ky, kx, reach, *shape, out, t0, t1),
                 len(targets),
                 200,
             )
@@ -364,8 +212,8 @@ class Belief:
         share = min(max(share, self.settings.heading_leak), 1.0 / 3.0)
         if share <= 0 or not len(self.keys):
             return
-        mass = _mass_of(self.blocks)[:, 0]
-        heavy = self.keys[mass * share > self.settings.keep * self._even_block]
+        mass = mass_of(self.blocks)[:, 0]
+        heavy = self.keys[mass * share > self.settings.keep * self.even_block]
         mark = np.zeros(self.index.shape, np.bool_)
         mark[self.keys[:, 0], self.keys[:, 1], self.keys[:, 2]] = True
         for d in (-1, 1):
@@ -374,7 +222,7 @@ class Belief:
         out = self._buffer(len(targets))
         before = float(mass.sum())
         blocks, index = self.blocks, self.index
-        split(lambda t0, t1: _mix(blocks, index, targets, share, out, t0, t1), len(targets), 1000)
+        split(lambda t0, t1: mix_headings(blocks, index, targets, share, out, t0, t1), len(targets), 1000)
         self._swap(targets, out)
         # What would have gone to unlisted neighbours lies somewhere on the map.
         self.rest += before - float(self.blocks.sum(dtype=np.float64))
@@ -397,7 +245,7 @@ class Belief:
             mixed = np.zeros(size, np.float32)
             parts_keys: list[NDArray[np.int32]] = []
             parts: list[F32] = []
-            limit = self.settings.keep * self._even_block
+            limit = self.settings.keep * self.even_block
             for h in range(self.headings):
                 rows = np.flatnonzero(self.keys[:, 0] == h)
                 if not len(rows):
@@ -424,7 +272,7 @@ class Belief:
                 for h in range(self.headings):
                     self._collect(h, even, by0, bx0, share, limit, parts_keys, parts)
             keys, blocks = _merged(parts_keys, parts, self.index.shape)
-            self._list(keys, blocks)
+            self.list_blocks(keys, blocks)
             # What was too thin to list lies somewhere on the map; what left the grid is off it.
             on_map = float(self._blurred(mixed, disc, by0, bx0).sum(dtype=np.float64))
             self.rest += max(0.0, on_map - float(blocks.sum(dtype=np.float64)))
@@ -462,246 +310,20 @@ class Belief:
         """Multiply by a likelihood (headings,) of the heading alone, relative to an even one, and normalise."""
         self.blocks *= factor[self.keys[:, 0], None, None].astype(np.float32)
         self.rest *= float(factor.mean())
-        self._normalise()
+        self.normalise()
         self.prune()
 
     def update(self, llr: F32, low: float, high: float, weight: float = 1.0) -> float:
         """Weigh listed blocks by (n, 16, 16) log-likelihood ratios (overwritten); returns the log of the evidence."""
-        self.blocks *= _factor(llr, low, high, weight)
+        self.blocks *= factor_of(llr, low, high, weight)
         self.blocks[self.blocks < 1e-25] = 0.0
-        total = self._normalise()
+        total = self.normalise()
         self.prune()
         return math.log(total)
-
-    def search(
-        self, llr_of: F32 | Callable[[int], F32 | None], low: float, high: float, weight: float = 1.0
-    ) -> float:
-        """Weigh the whole grid, unlisted ground included, and list what stands out; returns the log of the evidence.
-
-        Args:
-            llr_of: gives the (rows, cols) float32 log-likelihood ratios of one heading bin, which are overwritten, or
-                None to rule the heading out; or one such array that holds for all headings.
-            low, high: bounds of the ratios.
-            weight: factor of the ratios, for views that repeat what was seen.
-        """
-        # Headings arrive one by one, so the total is not yet known: what an even spread held is the first threshold.
-        threshold = self.settings.keep * self._even_block
-        limit = self.settings.max_blocks
-        keys: list[NDArray[np.int32]] = []
-        parts: list[F32] = []
-        count = 0
-        mass_all = 0.0
-        masses = np.zeros(self.grid, np.float64)
-        shared = _factor(llr_of, low, high, weight) if isinstance(llr_of, np.ndarray) else None
-        for h in range(self.headings):
-            if isinstance(llr_of, np.ndarray):
-                assert shared is not None
-                factor = shared
-            else:
-                llr = llr_of(h)
-                if llr is None:
-                    continue
-                factor = _factor(llr, low, high, weight)
-            even = np.float32(self.rest / self.cells)
-            _search_heading(factor, self.index[h], self.blocks, even, masses)
-            mass_all += float(masses.sum())
-            cells = np.argwhere(masses > threshold)
-            if len(cells):
-                out = np.empty((len(cells), BLOCK, BLOCK), np.float32)
-                _take_blocks(factor, self.index[h], self.blocks, even, cells, out)
-                keys.append(np.concatenate([np.full((len(cells), 1), h), cells], axis=1).astype(np.int32))
-                parts.append(out)
-                count += len(cells)
-            if count > 2 * limit:
-                threshold = self._raise_threshold(keys, parts, limit)
-                count = sum(map(len, keys))
-        all_keys = np.concatenate(keys) if keys else np.empty((0, 3), np.int32)
-        blocks = np.concatenate(parts) if parts else np.empty((0, BLOCK, BLOCK), np.float32)
-        self._list(all_keys, blocks)
-        self.rest = max(0.0, mass_all - float(blocks.sum(dtype=np.float64)))
-        total = self._normalise()
-        self.prune()
-        return math.log(total)
-
-    def search_tiers(self, tiers: Tiers, low: float, high: float, weight: float = 1.0) -> float:
-        """As ``search``, at full resolution only where it may matter; returns the log of the evidence.
-
-        Full resolution have the best blocks, listed or not, by belief and coarse ratios together (``FINE_SHARE`` of all).
-        Other listed blocks are weighed by their coarse ratios; so is what else stands out, which is listed with them: it
-        may be scored in full in the next frame. All other ground joins
-        ``rest`` with the mass that its coarse ratios, or their upper bounds, give it: what is passed over by mistake is
-        not lost, and while ``rest`` holds mass the next frame is searched anew.
-
-        Args:
-            tiers: the view's ratios.
-            low, high, weight: as in ``search``.
-        """
-        q, s = tiers.group, tiers.scale
-        side = BLOCK // s
-        coarse = tuple(-(-n // s) for n in self.grid)
-        groups = self.headings // q
-        # How many of a coarse cell's cells lie on the map, by row and by column.
-        inside = [
-            np.clip(self.shape[a] - s * np.arange(coarse[a] * BLOCK), 0, s).astype(np.float32) for a in (0, 1)
-        ]
-        count = [v.reshape(-1, side).sum(axis=1) for v in inside]
-        wide = (groups, coarse[0] * s, coarse[1] * s)
-        top, mass = np.full(wide, -np.inf, np.float32), np.zeros(wide, np.float32)
-        for g in range(groups):
-            keys = np.insert(tiers.places, 0, g, axis=1)
-            self._digest(tiers.rough(keys), tiers.places, inside, side, top[g], mass[g], low, high, weight)
-        scored = np.zeros(coarse, np.bool_)
-        scored[tiers.places[:, 0], tiers.places[:, 1]] = True
-        bound = _factor(np.where(scored, np.float32(-np.inf), tiers.bound), low, high, weight)
-        bound[scored] = 0.0
-        passed = float(count[0] @ bound.repeat(s, axis=0).repeat(s, axis=1) @ count[1]) * self.headings
-        top, mass = top[:, : self.grid[0], : self.grid[1]], mass[:, : self.grid[0], : self.grid[1]]
-
-        even = np.float32(self.rest / self.cells)
-        chosen = self._best(top, tiers, float(even), high, weight)
-        row = self.index[chosen[:, 0], chosen[:, 1], chosen[:, 2]]
-        order = np.argsort(row < 0, kind="stable")
-        chosen, row = chosen[order], row[order]
-        listed = int(np.count_nonzero(row >= 0))
-        blocks = _factor(tiers.fine(chosen), low, high, weight)
-        blocks[:listed] *= self.blocks[row[:listed]] + even
-        blocks[listed:] *= even
-        other = np.ones(len(self.keys), np.bool_)
-        other[row[:listed]] = False
-        left = self.keys[other]
-        by_coarse = self._coarse_factor(tiers, left, low, high, weight)
-        by_coarse *= self.blocks[other] + even
-        keys, blocks = np.concatenate([chosen, left]), np.concatenate([blocks, by_coarse])
-        self._clear_outside(keys, blocks)
-        blocks[blocks < 1e-25] = 0.0
-        rough = np.repeat(mass * even, q, axis=0)
-        rough[keys[:, 0], keys[:, 1], keys[:, 2]] = 0.0
-        # Listed blocks on ground that is passed over are among ``blocks``.
-        gone = keys[~scored[keys[:, 1] // s, keys[:, 2] // s]]
-        at = np.minimum(BLOCK, np.array(self.shape) - BLOCK * gone[:, 1:]).prod(axis=1)
-        passed -= float(at @ bound[gone[:, 1] // s, gone[:, 2] // s])
-        total = (
-            float(blocks.sum(dtype=np.float64))
-            + float(rough.sum(dtype=np.float64))
-            + passed * float(even)
-            + self.off
-        )
-
-        # Blocks of the whole belief that stand out, with the coarse ratios where there are no others.
-        own = _mass_of(blocks)[:, 0]
-        threshold = self.settings.keep * self._even_block * total
-        limit = self.settings.max_blocks
-        both = np.concatenate([own[own > threshold], rough[rough > threshold]])
-        if len(both) > limit:
-            threshold = max(threshold, float(np.partition(both, -limit)[-limit]))
-        stay = own > threshold
-        more = np.argwhere(rough > threshold).astype(np.int32)
-        fresh = self._coarse_factor(tiers, more, low, high, weight) * even
-        self._clear_outside(more, fresh)
-        self._list(np.concatenate([keys[stay], more]), np.concatenate([blocks[stay], fresh]))
-        self.rest = max(0.0, total - self.off - float(self.blocks.sum(dtype=np.float64)))
-        self._normalise()
-        self.prune()
-        return math.log(total)
-
-    def _coarse_factor(
-        self, tiers: Tiers, keys: NDArray[np.int32], low: float, high: float, weight: float
-    ) -> F32:
-        """(n, 16, 16) likelihood ratios of blocks (heading, row, col) by their coarse ratios, or by the bound of these
-        where there are none."""
-        q, s = tiers.group, tiers.scale
-        side = BLOCK // s
-        scored = np.zeros(tiers.bound.shape, np.bool_)
-        scored[tiers.places[:, 0], tiers.places[:, 1]] = True
-        row, col = keys[:, 1] // s, keys[:, 2] // s
-        has = scored[row, col]
-        out = np.empty((len(keys), BLOCK, BLOCK), np.float32)
-        out[~has] = _factor(tiers.bound[row, col][~has], low, high, weight)[:, None, None]
-        if has.any():
-            own = keys[has]
-            places, inverse = np.unique(own // np.array([q, s, s], np.int32), axis=0, return_inverse=True)
-            factor = _factor(tiers.rough(places), low, high, weight)
-            cut = factor.reshape(len(places), s, side, s, side).transpose(0, 1, 3, 2, 4)
-            cut = cut[inverse.ravel(), own[:, 1] % s, own[:, 2] % s]
-            out[has] = cut.repeat(s, axis=1).repeat(s, axis=2)
-        return out
-
-    FINE_SHARE = 0.03
-    FINE_LEAST, FINE_MOST = 2_000, 40_000
-
-    def _best(self, top: F32, tiers: Tiers, even: float, high: float, weight: float) -> NDArray[np.int32]:
-        """Keys to score in full: the best by their largest belief times their largest coarse likelihood ratio.
-
-        ``top`` (groups, block rows, block cols) holds the coarse ratios' maxima, -inf where there are none: of these
-        only listed blocks are taken, by their bounds.
-        """
-        q, s = tiers.group, tiers.scale
-        hope = np.repeat(np.minimum(top * np.float32(weight), np.float32(high)), q, axis=0)
-        hope += np.float32(math.log(max(even, 1e-30)))
-        if len(self.keys):
-            h, row, col = self.keys.T
-            ratio = np.where(
-                np.isfinite(top[h // q, row, col]), top[h // q, row, col], tiers.bound[row // s, col // s]
-            )
-            ratio = np.minimum(ratio * weight, high)
-            hope[h, row, col] = ratio + np.log(_mass_of(self.blocks)[:, 1] + max(even, 1e-30))
-        want = int(min(max(self.FINE_SHARE * hope.size, self.FINE_LEAST), self.FINE_MOST, hope.size))
-        flat = hope.ravel()
-        best = np.argpartition(flat, -want)[-want:]
-        best = np.sort(best[np.isfinite(flat[best])])
-        return np.stack(np.unravel_index(best, hope.shape), axis=1).astype(np.int32)
-
-    def _clear_outside(self, keys: NDArray[np.int32], blocks: F32) -> None:
-        """Zero in blocks what lies beyond the grid's last row and column."""
-        for axis in (0, 1):
-            last = np.flatnonzero(keys[:, 1 + axis] == self.grid[axis] - 1)
-            used = self.shape[axis] - (self.grid[axis] - 1) * BLOCK
-            if used < BLOCK:
-                blocks[(last, slice(used, None)) if axis == 0 else (last, slice(None), slice(used, None))] = (
-                    0.0
-                )
-
-    def _digest(
-        self,
-        llr: F32,
-        places: NDArray[np.int32],
-        inside: list[F32],
-        side: int,
-        top: F32,
-        mass: F32,
-        low: float,
-        high: float,
-        weight: float,
-    ) -> None:
-        """Largest ratio and summed likelihood ratio over the cells of each block, from coarse ratios (overwritten)."""
-        n, s = len(places), BLOCK // side
-        rows, cols = (v.reshape(-1, BLOCK)[places[:, a]] for a, v in enumerate(inside))
-        edge = np.flatnonzero((rows[:, -1] == 0) | (cols[:, -1] == 0))
-        llr[edge] = np.where(
-            (rows[edge, :, None] > 0) & (cols[edge, None, :] > 0), llr[edge], np.float32(-np.inf)
-        )
-        at = (
-            places[:, 0, None, None] * s + np.arange(s)[:, None],
-            places[:, 1, None, None] * s + np.arange(s),
-        )
-        top[at] = llr.reshape(n, s, side, s, side).max(axis=(2, 4))
-        factor = _factor(llr, low, high, weight)
-        factor *= rows[:, :, None]
-        factor *= cols[:, None, :]
-        mass[at] = factor.reshape(n, s, side, s, side).sum(axis=(2, 4))
-
-    @staticmethod
-    def _raise_threshold(keys: list[NDArray[np.int32]], parts: list[F32], limit: int) -> float:
-        mass = [_mass_of(p)[:, 0] for p in parts]
-        threshold = float(np.partition(np.concatenate(mass), -limit)[-limit])
-        for n, m in enumerate(mass):
-            stay = m >= threshold
-            keys[n], parts[n] = keys[n][stay], parts[n][stay]
-        return threshold
 
     def entropy(self) -> float:
         """Entropy over (heading, cell) and off the map, nats; unlisted ground counts as evenly spread."""
-        value = float(_entropy(self.blocks)) if len(self.blocks) else 0.0
+        value = float(entropy_of(self.blocks)) if len(self.blocks) else 0.0
         if self.rest > 0:
             value -= self.rest * math.log(self.rest / self.cells)
         if self.off > 0:
@@ -716,7 +338,7 @@ class Belief:
         if not len(self.keys):
             return np.empty((0, 2)), np.empty(0), 0
         even = 1.0 / self.cells
-        top = _mass_of(self.blocks)[:, 1]
+        top = mass_of(self.blocks)[:, 1]
         standing = self._standing(top, even)
         rows = np.argsort(top)[::-1][:count]
         flat = self.blocks[rows].reshape(-1)
@@ -747,7 +369,7 @@ class Belief:
         """The heaviest place within ``radius`` cells; None when nothing is listed."""
         if not len(self.keys):
             return None
-        top = _mass_of(self.blocks)[:, 1]
+        top = mass_of(self.blocks)[:, 1]
         s = int(np.argmax(top))
         i, j = np.unravel_index(int(np.argmax(self.blocks[s])), (BLOCK, BLOCK))
         h0 = int(self.keys[s, 0])

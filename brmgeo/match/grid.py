@@ -10,19 +10,23 @@ judge of whether there is a fix at all.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import FlightError
 from brmgeo.flight.values import Estimate, Motion, Status, View
 from brmgeo.match.belief import Belief, Mode
 from brmgeo.match.ground import GroundMap
+from brmgeo.match.history import History, kept
+from brmgeo.match.scorer import Scorer
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor, SmoothedPath, smooth_path
+from brmgeo.match.state import State, check_state, damaged, signature, under, within
+from brmgeo.match.steps import check_motion, check_view, nowhere
 from brmgeo.match.track import Track, wrap
 
 F32 = NDArray[np.float32]
@@ -30,103 +34,42 @@ F64 = NDArray[np.float64]
 Frame = Literal["odometry", "map", "body"]
 
 
-def check_view(view: View) -> None:
-    """Raises FlightError where a view cannot be matched: shapes, values that are not finite, heights, GSD."""
-    name = f"frame {view.file!r} at {view.t_s} s"
-    if view.building.ndim != 2 or view.building.shape != view.known.shape or view.building.size == 0:
-        raise FlightError(
-            f"{name}: mask {view.building.shape} and known {view.known.shape} must be equal "
-            "and not empty; rebuild the view"
-        )
-    numbers = (view.t_s, view.gsd_m, view.agl_m, view.radius_m, *view.nadir_px)
-    if not all(map(math.isfinite, numbers)) or min(view.gsd_m, view.agl_m, view.radius_m) <= 0:
-        raise FlightError(
-            f"{name}: GSD {view.gsd_m} m, height {view.agl_m} m, radius {view.radius_m} m, nadir {view.nadir_px} "
-            "must be finite and above 0; correct the flight's heights"
-        )
-    if not np.isfinite(view.building).all() or view.building.min() < 0 or view.building.max() > 1:
-        raise FlightError(f"{name}: mask values must lie in [0, 1]; rebuild the view")
+class GridMatcher:
+    """Bayes filter over place and heading; see the module.
 
+    Args:
+        method: its name.
+        ground: the map.
+        settings: of belief, odometry and the method.
+        scorer: how well a view fits where; fresh, of the same map and settings.
+        history: whether all frames are kept, so that the flight can be smoothed.
+    """
 
-def check_motion(motion: Motion, view: View) -> None:
-    """Raises FlightError where a motion is not finite or time runs backwards."""
-    numbers = [motion.dt_s, motion.sigma_m]
-    numbers += [] if motion.step_m is None else [float(v) for v in motion.step_m]
-    numbers += [v for v in (motion.yaw_rad, motion.compass_yaw_rad) if v is not None]
-    if not all(map(math.isfinite, numbers)) or motion.dt_s < 0 or motion.sigma_m < 0:
-        raise FlightError(
-            f"frame {view.file!r} at {view.t_s} s: motion {motion} is not finite or runs backwards; "
-            "correct the odometry"
-        )
-
-
-class GridMatcher(ABC):
-    """Bayes filter over place and heading; see the module. Subclasses say how well a view fits where."""
-
-    def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
+    def __init__(
+        self, method: str, ground: GroundMap, settings: MatchSettings, scorer: Scorer, history: bool
+    ) -> None:
+        self.method = method
         self.ground = ground
         self.settings = settings
-        self.cell_px = max(1, round(settings.belief.cell_m / ground.gsd_m))
-        self.cell_m = self.cell_px * ground.gsd_m
+        self.scorer = scorer
+        cell_px = settings.belief.cell_px(ground.gsd_m)
+        self.cell_m = cell_px * ground.gsd_m
         h, w = ground.building.shape
-        self.belief = Belief((-(-h // self.cell_px), -(-w // self.cell_px)), settings.belief)
+        self.belief = Belief((-(-h // cell_px), -(-w // cell_px)), settings.belief)
         self.track: Track | None = None
+        self.history = History() if history else None
+        self._started = False
         self._misses = 0
         self._off_frames = 0
         self._confirmed = False
-        self._fits: list[float] = []
+        self._fits: deque[float] = deque(maxlen=scorer.least_fit[1])
         self._frame: Frame = "odometry"
         self._unfixed_searches = 0
         self._since_informed_m = 0.0
-        self._views: list[View] = []
-        self._motions: list[Motion] = []
-        self._anchors: list[Anchor | None] = []
 
-    # What a method adds
-
-    @abstractmethod
-    def _look(self, view: View) -> None:
-        """Prepare for scoring one view."""
-
-    @abstractmethod
-    def _search(self, view: View, yaw_rad: float, body: F64 | None, weight: float) -> float:
-        """Weigh the belief by the view's ratios over the whole map; returns the log of the evidence.
-
-        ``yaw_rad`` is the body's yaw in the odometry frame; ``body`` is None, or (headings,) log weights of the body's
-        yaw in the map where the odometry does not know it.
-        """
-
-    @abstractmethod
-    def _score_listed(self, view: View, yaw_rad: float, body: F64 | None) -> F32:
-        """(n, 16, 16) ratios of the belief's listed blocks; arguments as in ``_search``."""
-
-    @abstractmethod
-    def _measure(self, view: View, pose: F64, covariance: F64) -> Anchor | None:
-        """The view's pose measured near a pose with a covariance, or None where it cannot be trusted."""
-
-    @abstractmethod
-    def _bounds(self) -> tuple[float, float]:
-        """Bounds of one frame's ratio."""
-
-    @abstractmethod
-    def _evidence(self, view: View) -> tuple[float, float]:
-        """Ground that the evidence comes from, square metres, and its weight per share of new ground."""
-
-    def _systematic(self) -> float:
-        """What all views of a flight get wrong together beside their levelling, metres per axis."""
-        return 0.0
-
-    def _lasting_m(self, view: View) -> float:
+    def _lasting_m(self, agl_m: float) -> float:
         """Error per axis that stays the same from frame to frame, metres: levelling, and what the method adds."""
-        return math.hypot(self.settings.odometry.attitude_sigma_rad * view.agl_m, self._systematic())
-
-    @abstractmethod
-    def _least_fit(self) -> tuple[float, int]:
-        """How well measured poses must fit before there is a first fix, in the mean of so many successive frames."""
-
-    @abstractmethod
-    def _learn(self, view: View, anchor: Anchor) -> None:
-        """Adapt to a view whose pose is well known."""
+        return math.hypot(self.settings.odometry.attitude_sigma_rad * agl_m, self.scorer.systematic_m)
 
     # The filter
 
@@ -137,21 +80,20 @@ class GridMatcher(ABC):
         """
         check_view(view)
         check_motion(motion, view)
-        started = bool(self._views)
         frame = _frame(motion)
         if frame == "map":
             motion = replace(motion, yaw_rad=motion.compass_yaw_rad)
-        self._views.append(_packed(view))
-        self._motions.append(motion)
-        self._anchors.append(None)
-        if started:
+        if self.history is not None:
+            self.history.add(view.t_s, motion, view)
+        if self._started:
             self._predict(motion, frame)
         self._frame = frame
         if motion.compass_yaw_rad is not None and motion.yaw_rad is not None:
             like = self._compass_likelihood(motion.compass_yaw_rad - motion.yaw_rad)
             self.belief.weigh_headings(like / like.mean())
-        self._look(view)
+        self.scorer.look(view)
         self._update(view, motion)
+        self._started = True
         mode = self.belief.mode(self.settings.belief.mode_radius_m / self.cell_m)
         return self._estimate(view, motion, mode)
 
@@ -202,9 +144,10 @@ class GridMatcher(ABC):
         if known and (
             self._unfixed_searches < 10 or self._unfixed_searches % 3 == 0 or not len(self.belief.keys)
         ):
-            gain = self._search(view, yaw, body, weight)
+            gain = self.scorer.search(self.belief, yaw, body, weight)
         else:
-            gain = self.belief.update(self._score_listed(view, yaw, body), *self._bounds(), weight)
+            llr = self.scorer.score_listed(self.belief, yaw, body)
+            gain = self.belief.update(llr, *self.settings.rates.bounds, weight)
         self._unfixed_searches += 1
         if gain > 2.0:
             self._since_informed_m = 0.0
@@ -219,9 +162,9 @@ class GridMatcher(ABC):
 
     def _novelty(self, view: View, motion: Motion) -> float:
         """Weight of the view's evidence, by the share of it that the view before did not show; 1 if unknown."""
-        if len(self._views) < 2 or motion.step_m is None:
+        if not self._started or motion.step_m is None:
             return 1.0
-        area, repeat = self._evidence(view)
+        area, repeat = self.scorer.evidence(view)
         # Even a view of old ground says a little: its mask has errors of its own.
         return min(1.0, max(0.02, repeat * float(np.hypot(*motion.step_m)) / math.sqrt(max(area, 1.0))))
 
@@ -238,6 +181,7 @@ class GridMatcher(ABC):
         s = self.settings.belief
         belief = self.belief
         self._off_frames = self._off_frames + 1 if belief.off > s.lost_mass else 0
+        none: Status = "lost" if self._off_frames >= s.lost_frames else "ambiguous"
         cells, mass, count = belief.heaviest(s.candidates)
         extra = {
             "entropy": belief.entropy(),
@@ -246,24 +190,7 @@ class GridMatcher(ABC):
             "listed_blocks": float(len(belief.keys)),
         }
         if mode is None:
-            h, w = self.ground.building.shape
-            g = self.ground.gsd_m
-            middle = np.array([self.ground.left + w * g / 2, self.ground.top - h * g / 2])
-            spread = np.diag([(w * g) ** 2, (h * g) ** 2]) / 12.0
-            status: Status = "lost" if self._off_frames >= s.lost_frames else "ambiguous"
-            return Estimate(
-                view.t_s,
-                status,
-                middle,
-                spread,
-                math.nan,
-                math.nan,
-                0.0,
-                np.empty((0, 2)),
-                np.empty(0),
-                0,
-                extra,
-            )
+            return nowhere(view, self.ground, none, extra)
         mean = self._world(mode.mean)
         r, c = mode.covariance[0, 0], mode.covariance[1, 1]
         cross = -mode.covariance[0, 1]
@@ -279,24 +206,35 @@ class GridMatcher(ABC):
         if self.track is not None:
             extra["scale"] = math.exp(float(self.track.mean[3]))
         # What lasts the whole flight is averaged away by no filter.
-        cov = cov + np.eye(2) * self._lasting_m(view) ** 2
+        cov = cov + np.eye(2) * self._lasting_m(view.agl_m) ** 2
         sigma = math.sqrt(float(np.trace(cov)) / 2.0)
-        if sure and sigma <= s.converged_sigma_m and self._confirmed:
-            status = "converged"
+        fixed = sure and sigma <= s.converged_sigma_m and self._confirmed
+        if fixed:
             self._unfixed_searches = 0
-        else:
-            status = "lost" if self._off_frames >= s.lost_frames else "ambiguous"
-        if motion.yaw_rad is not None:
-            yaw = wrap(heading + motion.yaw_rad)
-        elif motion.step_m is None:
-            yaw = wrap(heading)
-        elif motion.compass_yaw_rad is not None:
-            yaw, heading_sigma = wrap(motion.compass_yaw_rad), self.settings.odometry.compass_sigma_rad
-        else:
-            yaw, heading_sigma = math.nan, math.nan
+        yaw, yaw_sigma = self._body_yaw(motion, heading, heading_sigma)
         return Estimate(
-            view.t_s, status, mean, cov, yaw, heading_sigma, mode.mass, self._world(cells), mass, count, extra
+            t_s=view.t_s,
+            status="converged" if fixed else none,
+            mean=mean,
+            covariance=cov,
+            yaw_rad=yaw,
+            yaw_sigma_rad=yaw_sigma,
+            mass=mode.mass,
+            candidates=self._world(cells),
+            candidate_mass=mass,
+            candidate_count=count,
+            extra=extra,
         )
+
+    def _body_yaw(self, motion: Motion, heading: float, sigma: float) -> tuple[float, float]:
+        """Yaw of the body in the map and its deviation, from the heading that the belief or the track knows."""
+        if motion.yaw_rad is not None:
+            return wrap(heading + motion.yaw_rad), sigma
+        if motion.step_m is None:
+            return wrap(heading), sigma
+        if motion.compass_yaw_rad is not None:
+            return wrap(motion.compass_yaw_rad), self.settings.odometry.compass_sigma_rad
+        return math.nan, math.nan
 
     def _follow(
         self, view: View, motion: Motion, mean: F64, cov: F64, heading: float, heading_sigma: float
@@ -332,7 +270,7 @@ class GridMatcher(ABC):
             pose[2] = motion.compass_yaw_rad
             pose_cov[2, :] = pose_cov[:, 2] = 0.0
             pose_cov[2, 2] = odo.compass_sigma_rad**2
-        anchor = self._measure(view, pose, pose_cov)
+        anchor = self.scorer.measure(view, pose, pose_cov)
         if anchor is not None and body is None and motion.step_m is not None:
             # The body's yaw says nothing of the odometry frame's heading.
             place = anchor.covariance.copy()
@@ -346,8 +284,9 @@ class GridMatcher(ABC):
                 self._misses = 0
                 self._confirmed |= self._fits_well(anchor.fit)
                 if self._confirmed:
-                    self._anchors[-1] = anchor
-                    self._learn(view, anchor)
+                    if self.history is not None:
+                        self.history.anchors[-1] = anchor
+                    self.scorer.learn(anchor)
             else:
                 self._misses += 1
                 if self._misses >= 3:
@@ -367,16 +306,20 @@ class GridMatcher(ABC):
         # A view of next to no building has no fit, good or bad.
         if not math.isnan(fit):
             self._fits.append(fit)
-        least, frames = self._least_fit()
-        return len(self._fits) >= frames and float(np.mean(self._fits[-frames:])) >= least
+        least, frames = self.scorer.least_fit
+        return len(self._fits) == frames and float(np.mean(self._fits)) >= least
 
     # After the flight
 
     def smooth(self) -> SmoothedPath:
-        """The most likely path of the whole flight so far, also before the first fix; see ``brmgeo.match.smooth``."""
+        """The most likely path of the whole flight so far, also before the first fix; see ``brmgeo.match.smooth``.
+
+        Raises SettingsError where no history is kept.
+        """
+        history = kept(self.history)
 
         def register(i: int, pose: F64, covariance: F64) -> Anchor | None:
-            anchor = self._measure(_unpacked(self._views[i]), pose, covariance)
+            anchor = self.scorer.measure(history.views[i].view(history.times_s[i]), pose, covariance)
             if anchor is None:
                 return None
             error = anchor.pose - pose
@@ -385,10 +328,56 @@ class GridMatcher(ABC):
             return anchor if d2 < 16.3 else None
 
         path = smooth_path(
-            [v.t_s for v in self._views], self._motions, self._anchors, self.settings.odometry, register
+            history.times_s, history.motions, history.anchors, self.settings.odometry, register
         )
-        lasting = np.array([self._lasting_m(v) for v in self._views])
+        lasting = np.array([self._lasting_m(v.agl_m) for v in history.views])
         return SmoothedPath(path.t_s, path.xy, path.yaw_rad, np.hypot(path.sigma_m, lasting))
+
+    # From process to process
+
+    def state(self) -> State:
+        """All that the frames so far have left, as named arrays; see ``brmgeo.match.state``."""
+        tracks = [] if self.track is None else [self.track]
+        parts = within("belief", self.belief.state()) | within("scorer", self.scorer.state())
+        if self.history is not None:
+            parts |= within("history", self.history.state())
+        return {
+            **signature(self.method, self.ground, self.settings),
+            **parts,
+            "track.mean": np.array([t.mean for t in tracks], np.float64).reshape(-1, 4),
+            "track.covariance": np.array([t.covariance for t in tracks], np.float64).reshape(-1, 4, 4),
+            "started": np.array(self._started),
+            "misses": np.array(self._misses),
+            "off_frames": np.array(self._off_frames),
+            "confirmed": np.array(self._confirmed),
+            "fits": np.array(self._fits, np.float64),
+            "frame": np.array(self._frame),
+            "unfixed_searches": np.array(self._unfixed_searches),
+            "since_informed_m": np.array(self._since_informed_m),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what ``state`` gave: the next steps give what the uninterrupted matcher would have given, bit for bit.
+
+        This matcher must be fresh. Raises InputError for a state of another method, map or settings, or one with a
+        history where this one keeps none (or the other way round), or a damaged one; then make another matcher.
+        """
+        check_state(state, self.state())
+        frame = str(state["frame"])
+        if frame not in get_args(Frame) or len(state["track.mean"]) != len(state["track.covariance"]):
+            raise damaged("its track or frame is not one")
+        self.belief.restore(under(state, "belief"))
+        self.scorer.restore(under(state, "scorer"))
+        if self.history is not None:
+            self.history.restore(under(state, "history"))
+        track = under(state, "track")
+        self.track = Track(track["mean"][0], track["covariance"][0]) if len(track["mean"]) else None
+        self._started, self._confirmed = bool(state["started"]), bool(state["confirmed"])
+        self._misses, self._off_frames = int(state["misses"]), int(state["off_frames"])
+        self._fits.extend(state["fits"].tolist())
+        self._frame = cast(Frame, frame)
+        self._unfixed_searches = int(state["unfixed_searches"])
+        self._since_informed_m = float(state["since_informed_m"])
 
 
 def _frame(motion: Motion) -> Frame:
@@ -397,16 +386,3 @@ def _frame(motion: Motion) -> Frame:
     if motion.step_m is not None or motion.yaw_rad is not None:
         return "odometry"
     return "map" if motion.compass_yaw_rad is not None else "body"
-
-
-def _packed(view: View) -> View:
-    """The view in a quarter of the memory: the smoother looks at every view again."""
-    scaled = np.rint(view.building * 255).astype(np.uint8)
-    return View(view.t_s, scaled, view.known, view.gsd_m, view.nadir_px, view.agl_m, view.radius_m, view.file)  # type: ignore[arg-type]
-
-
-def _unpacked(view: View) -> View:
-    building = view.building.astype(np.float32) / np.float32(255)
-    return View(
-        view.t_s, building, view.known, view.gsd_m, view.nadir_px, view.agl_m, view.radius_m, view.file
-    )

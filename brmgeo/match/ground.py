@@ -9,11 +9,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import BUILDING, UNKNOWN
 from brmgeo.errors import InputError
-from brmgeo.match.belief import BLOCK
+from brmgeo.match.kernels import BLOCK
 from brmgeo.match.threads import split
-
-UNKNOWN = 255
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,12 +47,12 @@ class GroundMap:
         counts = np.zeros(256, np.int64)
         for i in range(0, b.shape[0], band):
             counts += np.bincount(b[i : i + band].ravel(), minlength=256)
-        if counts[2:UNKNOWN].any():
+        if counts[BUILDING + 1 : UNKNOWN].any():
             raise InputError(
                 "a building map holds 0, 1 and 255 (unknown) only: "
-                f"found {int(np.flatnonzero(counts[2:UNKNOWN])[0]) + 2}; convert it"
+                f"found {int(np.flatnonzero(counts[BUILDING + 1 : UNKNOWN])[0]) + BUILDING + 1}; convert it"
             )
-        if counts[1] == 0:
+        if counts[BUILDING] == 0:
             raise InputError(
                 f"the map of {b.shape[1] * self.gsd_m:.0f} x {b.shape[0] * self.gsd_m:.0f} m has no building: "
                 "nothing can be matched to it; check the region and its footprints"
@@ -77,8 +76,8 @@ def _count_cells(building, side, built, known, i0, i1):  # type: ignore[no-untyp
             for j in range(built.shape[1]):
                 some, seen = 0, 0
                 for x in range(j * side, min(cols, (j + 1) * side)):
-                    some += line[x] == 1
-                    seen += line[x] != 255
+                    some += line[x] == BUILDING
+                    seen += line[x] != UNKNOWN
                 built[i, j] += some
                 known[i, j] += seen
 
@@ -136,7 +135,7 @@ def _disc_sums(prefix, shape, at, weight, first, blocks, shift, out, n0, n1):  #
                     out[k, n, i, j] = acc[j]
 
 
-def _chords(radius: float, factor: int) -> tuple[int, NDArray[np.int64], NDArray[np.float32]]:
+def chords(radius: float, factor: int) -> tuple[int, NDArray[np.int64], NDArray[np.float32]]:
     """First row, ends (rows, 4, 2) and weights (rows, 4) of ``_disc_sums`` for a disc of ``radius`` sub-cells."""
     middle = factor / 2.0
     first, last = math.floor(middle - radius), math.ceil(middle + radius)
@@ -167,21 +166,27 @@ class DiscAreas:
     Args:
         ground: the map.
         cell_px: pixels of a cell's side.
+
+    Attributes:
+        cells, blocks: (rows, cols) of the map's cells, and of the blocks that hold them.
+        margin: how many cells around the map were summed, -1 before the first disc. Sums of known ground are rounded
+            where unknown ground lies within it, so equal answers need an equal margin.
     """
 
     def __init__(self, ground: GroundMap, cell_px: int) -> None:
         h, w = ground.building.shape
         self._cell_m = cell_px * ground.gsd_m
-        self._cells = (-(-h // cell_px), -(-w // cell_px))
+        self.cells = (-(-h // cell_px), -(-w // cell_px))
+        self.blocks = (-(-self.cells[0] // BLOCK), -(-self.cells[1] // BLOCK))
+        self.margin = -1
         factor = next((f for f in range(2, cell_px + 1) if cell_px % f == 0), 1)
-        if self._cells[0] * self._cells[1] * factor**2 > 300_000_000:
+        if self.cells[0] * self.cells[1] * factor**2 > 300_000_000:
             factor = 1
         self._factor = factor
         built, known = ground.coverage(cell_px // factor)
         if factor > 1:
             known = ground.coverage(cell_px)[1]
         self._covers = ((built, factor), (known, 1))
-        self._margin = -1
         self._prefix: list[NDArray[np.float32]] = []
         self._whole = np.empty((0, 0), np.bool_)
 
@@ -193,10 +198,7 @@ class DiscAreas:
         ``blocks`` is (n, 2): row and column of blocks. Ground beyond the map's edge is unknown.
         """
         margin = math.ceil(float(radii_m.max()) / self._cell_m) + 2
-        if margin > self._margin:
-            self._margin = margin
-            self._prefix = [_row_sums(cover, f, self._cells, margin) for cover, f in self._covers]
-            self._whole = self._all_known()
+        self.widen(margin)
         built = self._sums(0, blocks, radii_m)
         known = np.empty_like(built)
         whole = self._whole[blocks[:, 0], blocks[:, 1]]
@@ -204,10 +206,17 @@ class DiscAreas:
         known[:, ~whole] = self._sums(1, blocks[~whole], radii_m)
         return built, np.maximum(known, built, out=known)
 
+    def widen(self, margin: int) -> None:
+        """Sum as far as ``margin`` cells around the map, if it is not done."""
+        if margin > self.margin:
+            self.margin = margin
+            self._prefix = [_row_sums(cover, f, self.cells, margin) for cover, f in self._covers]
+            self._whole = self._all_known()
+
     def _all_known(self) -> NDArray[np.bool_]:
         """(block rows, block cols): whether all ground in reach of a block is known."""
         sums = self._prefix[1][0]
-        side = BLOCK + 2 * self._margin
+        side = BLOCK + 2 * self.margin
         across = sums[:, side::BLOCK] - sums[:, :-side:BLOCK]
         down = np.cumsum(across, axis=0, dtype=np.float64)
         down = np.concatenate([np.zeros((1, down.shape[1])), down])
@@ -219,7 +228,7 @@ class DiscAreas:
         """(radii, n, 16, 16) square metres of one cover in discs."""
         prefix, factor = self._prefix[which], self._covers[which][1]
         sub_m = self._cell_m / factor
-        discs = [_chords(float(r) / sub_m, factor) for r in radii_m]
+        discs = [chords(float(r) / sub_m, factor) for r in radii_m]
         rows = max(len(weight) for _, _, weight in discs)
         at = np.zeros((len(discs), rows + 1, 4), np.int64)
         weight = np.zeros((len(discs), rows + 1, 4), np.float32)
@@ -228,7 +237,7 @@ class DiscAreas:
             weight[k, : len(ends)] = weights
         first = np.array([top for top, _, _ in discs])
         sums = np.empty((len(discs), len(blocks), BLOCK, BLOCK), np.float32)
-        flat, margin = prefix.reshape(-1), self._margin
+        flat, margin = prefix.reshape(-1), self.margin
         split(
             lambda n0, n1: _disc_sums(flat, prefix.shape, at, weight, first, blocks, margin, sums, n0, n1),
             len(blocks),

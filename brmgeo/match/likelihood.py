@@ -27,7 +27,9 @@ its cells, half and half with an even spread over rings.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numba as nb
@@ -36,8 +38,9 @@ from numpy.typing import NDArray
 
 from brmgeo.flight.values import View
 from brmgeo.maps.ratio import Disjoint
-from brmgeo.match.belief import BLOCK
+from brmgeo.match.kernels import BLOCK
 from brmgeo.match.settings import RateSettings, RatioSettings
+from brmgeo.match.state import State
 from brmgeo.match.threads import split
 
 F32 = NDArray[np.float32]
@@ -161,6 +164,20 @@ class RateLearner:
 
     def _prior(self, share: float) -> F64:
         return np.array([share, 1.0 - share]) * self.PRIOR
+
+    def state(self) -> State:
+        """The counts and the rates as named arrays."""
+        return {
+            "hits": self._hits,
+            "alarms": self._alarms,
+            "rates": np.array([self.rates.hit, self.rates.false_alarm], np.float64),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take up what ``state`` gave."""
+        self._hits, self._alarms = state["hits"], state["alarms"]
+        hit, false_alarm = state["rates"].tolist()
+        self.rates = Rates(hit, false_alarm, self._settings.independent_m2)
 
 
 @nb.njit(cache=True, nogil=True)

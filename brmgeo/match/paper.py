@@ -32,24 +32,31 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import RATIO_SCALE, RATIO_UNKNOWN, disc_radii
 from brmgeo.flight.values import Estimate, Motion, Status, View
-from brmgeo.flight.view import features
+from brmgeo.flight.view import Features, features
 from brmgeo.maps.ratio import ratio_maps
-from brmgeo.match.grid import check_motion, check_view
 from brmgeo.match.ground import GroundMap
+from brmgeo.match.history import History, kept
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor, SmoothedPath, smooth_path
+from brmgeo.match.state import State, check_state, damaged, signature, under, within
+from brmgeo.match.steps import check_motion, check_view, nowhere
 from brmgeo.match.threads import split
 from brmgeo.match.track import wrap
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
+
+STEPS = round(1 / RATIO_SCALE)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
@@ -63,8 +70,8 @@ def _search(maps, wanted, limit, counts, out, i0, i1):  # type: ignore[no-untype
             f = wanted[k]
             for j in range(cols):
                 v = np.int32(source[j])
-                # 65535 is further than any limit from any ratio.
-                line[j] += abs(v - f) + (v == 65535) * 1_000_000
+                # What is unknown is further than any limit from any ratio.
+                line[j] += abs(v - f) + (v == RATIO_UNKNOWN) * 1_000_000
         total = 0
         target = out[i]
         for j in range(cols):
@@ -84,8 +91,8 @@ def search(maps: NDArray[np.uint16], f: F64, e1: float, out: U8) -> int:
         out: (H, W) uint8, written.
     """
     counts = np.empty(maps.shape[1], np.int64)
-    wanted = np.rint(f * 1e4).astype(np.int32)
-    limit = np.int32(min(math.ceil(e1 * 1e4 - 1e-6), 900_000))
+    wanted = np.rint(f * STEPS).astype(np.int32)
+    limit = np.int32(min(math.ceil(e1 * STEPS - 1e-6), 900_000))
     split(lambda i0, i1: _search(maps, wanted, limit, counts, out, i0, i1), len(counts), 64)
     return int(counts.sum())
 
@@ -233,7 +240,7 @@ def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple
 
 
 @nb.njit(cache=True, nogil=True)
-def _follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distance, eps, limit, pairs):  # type: ignore[no-untyped-def]
+def follow_pairs(rows_at, cols_at, row_start, prev, theta_start, theta, distance, eps, limit, pairs):  # type: ignore[no-untyped-def]
     """Pairs (new, previous) that eq. 4 and 6 allow.
 
     New candidates by row (cols_at sorted within row_start[i]:row_start[i + 1]); previous ones (m, 2) row, col with
@@ -280,9 +287,10 @@ class PaperMatcher:
     are left, ``lost`` when a frame fits nowhere on the map.
     """
 
-    def __init__(self, ground: GroundMap, settings: MatchSettings) -> None:
+    def __init__(self, ground: GroundMap, settings: MatchSettings, history: bool) -> None:
         self.ground = ground
         self.settings = settings
+        self.history = History() if history else None
         shape = ground.building.shape
         self._maps: OrderedDict[int, NDArray[np.uint16]] = OrderedDict()
         self._now = np.zeros(shape, np.uint8)
@@ -296,17 +304,13 @@ class PaperMatcher:
         self._theta = np.empty(0)
         self._last_step: F64 | None = None
         self._pairs = np.empty((2_000_000, 2), np.int32)
-        self._times: list[float] = []
-        self._motions: list[Motion] = []
-        self._anchors: list[Anchor | None] = []
 
-    def _ratios(self, radii_m: F64) -> NDArray[np.uint16]:
-        """(n, H, W) ratio maps for the frame's radii, rounded to the ladder; the last few steps are kept."""
+    def _ratios(self, largest_m: float) -> NDArray[np.uint16]:
+        """(n, H, W) ratio maps for a frame's largest radius, rounded to the ladder; the last few steps are kept."""
         step = math.log1p(self.settings.ratio.radius_step)
-        key = round(math.log(float(radii_m[0])) / step)
+        key = round(math.log(largest_m) / step)
         if key not in self._maps:
-            factor = math.exp(key * step) / float(radii_m[0])
-            radii = [float(r) * factor / self.ground.gsd_m for r in radii_m]
+            radii = disc_radii(math.exp(key * step) / self.ground.gsd_m, self.settings.paper.radii)
             self._maps[key] = ratio_maps(self.ground.building, radii, threads=2)
             while len(self._maps) > 4:
                 self._maps.popitem(last=False)
@@ -320,36 +324,34 @@ class PaperMatcher:
         """
         check_view(view)
         check_motion(motion, view)
-        s = self.settings.paper
-        self._times.append(view.t_s)
-        self._motions.append(motion)
-        f = features(view, s.radii)
+        if self.history is not None:
+            self.history.add(view.t_s, motion)
+        f = features(view, self.settings.paper.radii)
         restarted = False
-        if np.isfinite(f.f).all():
-            found = search(self._ratios(f.radii_m), f.f, s.e1, self._now)
-        else:
-            self._now[:] = 1
-            found = self._now.size
-        searched = found
+        found = searched = self._search(f)
         if self._have and found:
-            kept = self._constrain(motion)
-            if kept == 0:
+            left = self._constrain(motion)
+            if left == 0:
                 # None left: start again from this frame's own search.
                 restarted = True
                 self._places = None
-                if np.isfinite(f.f).all():
-                    search(self._ratios(f.radii_m), f.f, s.e1, self._now)
-                else:
-                    self._now[:] = 1
+                self._search(f)
             else:
-                found = kept
+                found = left
         elif not found:
             self._places = None
-        self._count = int(found)
+        self._count = found
         self._have = found > 0
         self._last_step = None if motion.step_m is None else np.asarray(motion.step_m, np.float64)
         self._before, self._now = self._now, self._before
-        return self._estimate(view, motion, int(searched), restarted)
+        return self._estimate(view, motion, searched, restarted)
+
+    def _search(self, f: Features) -> int:
+        """Mark in ``_now`` what fits a frame by itself, all where a ratio of it is unknown; returns how many."""
+        if np.isfinite(f.f).all():
+            return search(self._ratios(float(f.radii_m[0])), f.f, self.settings.paper.e1, self._now)
+        self._now[:] = 1
+        return self._now.size
 
     def _constrain(self, motion: Motion) -> int:
         """Keep of ``_now`` what the motion allows from ``_before``; returns how many are left."""
@@ -415,7 +417,7 @@ class PaperMatcher:
         if self.settings.paper.follow_turns and np.hypot(*step) > 0 and np.hypot(*self._last_step) > 0:
             turn = math.atan2(step[1], step[0]) - math.atan2(self._last_step[1], self._last_step[0])
         places, start = self._listed()
-        n = _follow_pairs(
+        n = follow_pairs(
             places[:, 0], places[:, 1], start, self._places, self._theta_start, self._theta + turn, distance, eps,
             len(self._pairs), self._pairs,
         )  # fmt: skip
@@ -441,22 +443,7 @@ class PaperMatcher:
         extra = {"searched": float(searched), "restarted": float(restarted)}
         rows, cols = self.ground.building.shape
         if not self._have:
-            middle = np.array([self.ground.left + cols * g / 2, self.ground.top - rows * g / 2])
-            spread = np.diag([(cols * g) ** 2, (rows * g) ** 2]) / 12.0
-            self._anchors.append(None)
-            return Estimate(
-                view.t_s,
-                "lost",
-                middle,
-                spread,
-                math.nan,
-                math.nan,
-                0.0,
-                np.empty((0, 2)),
-                np.empty(0),
-                0,
-                extra,
-            )
+            return nowhere(view, self.ground, "lost", extra)
         by_row, by_col = np.empty(rows, np.int32), np.empty(cols, np.int32)
         most = self.settings.belief.candidates
         sample = np.empty((most, 2), np.int32)
@@ -478,14 +465,22 @@ class PaperMatcher:
         candidates = np.stack([x[sample[:taken, 1]], y[sample[:taken, 0]]], axis=1)
         cov = np.diag(np.maximum(var, s.eps_m**2 / 3.0))
         heading, heading_sigma = self._heading(motion)
-        anchor = None
-        if status == "converged":
-            anchor = Anchor(np.array([*mean, 0.0]), np.diag([cov[0, 0], cov[1, 1], math.pi**2]))
-        self._anchors.append(anchor)
+        if status == "converged" and self.history is not None:
+            spread = np.diag([cov[0, 0], cov[1, 1], math.pi**2])
+            self.history.anchors[-1] = Anchor(np.array([*mean, 0.0]), spread)
         return Estimate(
-            view.t_s, status, mean, cov, heading, heading_sigma, 1.0 if status == "converged" else 1.0 / self._count,
-            candidates, np.full(len(candidates), 1.0 / self._count), self._count, extra,
-        )  # fmt: skip
+            t_s=view.t_s,
+            status=status,
+            mean=mean,
+            covariance=cov,
+            yaw_rad=heading,
+            yaw_sigma_rad=heading_sigma,
+            mass=1.0 if status == "converged" else 1.0 / self._count,
+            candidates=candidates,
+            candidate_mass=np.full(len(candidates), 1.0 / self._count),
+            candidate_count=self._count,
+            extra=extra,
+        )
 
     def _heading(self, motion: Motion) -> tuple[float, float]:
         """Yaw of the body in the map and its spread, from the directions in which the candidates arrived."""
@@ -499,8 +494,50 @@ class PaperMatcher:
         return wrap(math.atan2(total.imag, total.real) - course + motion.yaw_rad), sigma
 
     def smooth(self) -> SmoothedPath:
-        """The path through all fixes by odometry; the paper itself has no smoother."""
+        """The path through all fixes by odometry; the paper itself has no smoother.
+
+        Raises SettingsError where no history is kept.
+        """
+        history = kept(self.history)
         # A set's mean says nothing of the yaw: the heading comes from the fixes' places.
-        motions = [Motion(m.dt_s, m.step_m, None, m.sigma_m) for m in self._motions]
-        path = smooth_path(self._times, motions, self._anchors, self.settings.odometry)
-        return path
+        motions = [Motion(m.dt_s, m.step_m, None, m.sigma_m) for m in history.motions]
+        return smooth_path(history.times_s, motions, history.anchors, self.settings.odometry)
+
+    def state(self) -> State:
+        """All that the frames so far have left, as named arrays; see ``brmgeo.match.state``."""
+        paired = self._places is not None
+        return {
+            **signature("paper", self.ground, self.settings),
+            **({} if self.history is None else within("history", self.history.state())),
+            "before": np.packbits(self._before),
+            "have": np.array(self._have),
+            "count": np.array(self._count),
+            "paired": np.array(paired),
+            "places": np.empty((0, 2), np.int32) if self._places is None else self._places,
+            "theta": self._theta if paired else np.empty(0),
+            "theta_start": self._theta_start if paired else np.empty(0, np.int64),
+            "last_step": np.full(2, np.nan) if self._last_step is None else self._last_step,
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what ``state`` gave: the next steps give what the uninterrupted matcher would have given, bit for bit.
+
+        This matcher must be fresh. Raises InputError for a state of another method, map or settings, or one with a
+        history where this one keeps none (or the other way round), or a damaged one; then make another matcher.
+        """
+        check_state(state, self.state())
+        start, theta = np.array(state["theta_start"]), np.array(state["theta"])
+        if bool(state["paired"]) and (
+            len(start) != len(state["places"]) + 1
+            or (start[0], start[-1]) != (0, len(theta))
+            or (np.diff(start) < 0).any()
+        ):
+            raise damaged("its pairs do not fit its candidates")
+        if self.history is not None:
+            self.history.restore(under(state, "history"))
+        self._before = np.unpackbits(state["before"], count=self._before.size).reshape(self._before.shape)
+        self._have, self._count = bool(state["have"]), int(state["count"])
+        self._places = np.array(state["places"]) if state["paired"] else None
+        self._theta, self._theta_start = theta, start
+        step = np.array(state["last_step"])
+        self._last_step = None if np.isnan(step[0]) else step

@@ -17,8 +17,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import BUILDING, OTHER, UNKNOWN
 from brmgeo.flight.values import View
-from brmgeo.match.ground import UNKNOWN, GroundMap, cell_shares
+from brmgeo.match.ground import GroundMap, cell_shares
 from brmgeo.match.likelihood import Rates, ViewPoints, view_points
 from brmgeo.match.threads import split
 
@@ -221,7 +222,7 @@ class Registrar:
         kind = np.full(len(x), UNKNOWN, np.uint8)
         kind[ok] = g.building[row[ok], col[ok]]
         other = points.known - points.built
-        on, off = kind == 1, kind == 0
+        on, off = kind == BUILDING, kind == OTHER
         return (
             float(points.built[on].sum()),
             float(other[on].sum()),

@@ -113,6 +113,11 @@ class RateSettings:
         )
         _check_rates(self)
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of one frame's log-likelihood ratio."""
+        return self.llr_min, self.llr_max
+
 
 @dataclass(frozen=True, slots=True)
 class BeliefSettings:
@@ -168,6 +173,10 @@ class BeliefSettings:
             lost_frames=(1, 1000),
             candidates=(1, 1_000_000),
         )
+
+    def cell_px(self, gsd_m: float) -> int:
+        """Whole pixels of a map of ``gsd_m`` to a cell's side, at least one."""
+        return max(1, round(self.cell_m / gsd_m))
 
 
 @dataclass(frozen=True, slots=True)

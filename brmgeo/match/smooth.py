@@ -223,10 +223,10 @@ class _Piece:
             info = info * (1.0 if d2 <= self.ROBUST else (self.ROBUST / d2))
             diag[i, :rows, :rows] += info
             right[i, :rows] -= info @ error
-        return _solve_tridiagonal(diag, below, right)
+        return solve_tridiagonal(diag, below, right)
 
 
-def _solve_tridiagonal(diag: F64, below: F64, right: F64) -> tuple[F64, F64]:
+def solve_tridiagonal(diag: F64, below: F64, right: F64) -> tuple[F64, F64]:
     """Solution (n, m) of the symmetric block-tridiagonal system and the (n, m, m) diagonal blocks of its inverse."""
     n, _m = right.shape
     pivot_inv = np.empty_like(diag)

@@ -36,7 +36,7 @@ def flight(scene: Town = SCENE, start: tuple[float, float] = (1500.0, 5500.0), *
 @pytest.fixture(scope="module")
 def plain() -> tuple[Flight, list, object]:
     f = flight(scale=1.05)
-    matcher = make_matcher("mask", GROUND, QUICK)
+    matcher = make_matcher("mask", GROUND, QUICK, history=True)
     return f, run(matcher, f), matcher
 
 
@@ -119,7 +119,7 @@ def test_turn_the_view_and_only_the_heading_turns(plain) -> None:  # type: ignor
 def test_blank_views_never_give_a_position(method: str) -> None:
     settings = replace(QUICK, paper=PaperSettings(e1=0.2))
     ground = town(21, 600.0, 150).ground(2.0)
-    matcher = make_matcher(method, ground, settings)
+    matcher = make_matcher(method, ground, settings, history=True)
     for i in range(14):
         estimate = matcher.step(
             blank_view(5.0 * i), Motion(5.0 * bool(i), np.array([20.0, 0.0]) if i else None, 0.0, 0.1)
@@ -341,7 +341,7 @@ def test_paper_narrows_the_candidates_to_the_truth() -> None:
     scene = town(42, 600.0, 330)
     f = fly(scene, *path((1180.0, 5240.0), [(0.3, 9)], step_m=20.0), missed=0.0)
     settings = MatchSettings(paper=PaperSettings(radii=6, e1=0.08, eps_m=5.0, d_max_m=20.0))
-    matcher = make_matcher("paper", scene.ground(), settings)
+    matcher = make_matcher("paper", scene.ground(), settings, history=True)
     estimates = run(matcher, f)
     assert estimates[0].candidate_count > 100
     fixes = [i for i, e in enumerate(estimates) if e.status == "converged"]
@@ -412,7 +412,7 @@ def test_a_start_without_evidence_is_ambiguous_not_lost() -> None:
 def test_the_systematic_error_is_reported_and_does_not_move_the_fix(plain) -> None:  # type: ignore[no-untyped-def]
     f, estimates, matcher = plain
     settings = replace(QUICK, rates=replace(QUICK.rates, systematic_sigma_m=0.0))
-    without = make_matcher("mask", GROUND, settings)
+    without = make_matcher("mask", GROUND, settings, history=True)
     for a, b in zip(estimates, run(without, f)):
         assert a.status == b.status
         np.testing.assert_allclose(a.mean, b.mean)
@@ -427,7 +427,7 @@ def test_the_systematic_error_is_reported_and_does_not_move_the_fix(plain) -> No
 
 def test_a_single_frame_and_none_at_all() -> None:
     for method in ("mask", "ratio", "paper"):
-        matcher = make_matcher(method, GROUND, QUICK)
+        matcher = make_matcher(method, GROUND, QUICK, history=True)
         assert matcher.smooth().xy.shape == (0, 2)
         estimate = matcher.step(view_at(SCENE, 1500, 5500, 0.0), Motion(0.0, None, None))
         assert estimate.position is None or math.hypot(estimate.mean[0] - 1500, estimate.mean[1] - 5500) < 5

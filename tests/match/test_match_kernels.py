@@ -23,8 +23,9 @@ from brmgeo.match import (
     RatioSettings,
     make_matcher,
 )
-from brmgeo.match.belief import BLOCK, Belief
-from brmgeo.match.ground import DiscAreas, _chords, disc_pixels
+from brmgeo.match.belief import Belief
+from brmgeo.match.ground import DiscAreas, chords, disc_pixels
+from brmgeo.match.kernels import BLOCK
 from brmgeo.match.likelihood import (
     MapCover,
     MaskTiers,
@@ -36,9 +37,11 @@ from brmgeo.match.likelihood import (
     view_points,
     view_rings,
 )
-from brmgeo.match.paper import RingReach, _follow_pairs, ring_spans, search
+from brmgeo.match.paper import RingReach, follow_pairs, ring_spans
+from brmgeo.match.paper import search as search_pixels
 from brmgeo.match.register import Registrar
-from brmgeo.match.smooth import Anchor, _solve_tridiagonal, smooth_path
+from brmgeo.match.search import search, search_tiers
+from brmgeo.match.smooth import Anchor, smooth_path, solve_tridiagonal
 from brmgeo.match.track import Track
 
 RATES = Rates(0.85, 0.03, 300.0)
@@ -53,7 +56,7 @@ def test_search_equals_numpy() -> None:
     maps[1, 3, 4] = 65535
     out = np.empty((150, 70), np.uint8)
     for e1 in (0.05, 0.4, 2.9):
-        n = search(maps, np.array([0.3, 0.51234, 0.2]), e1, out)
+        n = search_pixels(maps, np.array([0.3, 0.51234, 0.2]), e1, out)
         wanted = np.array([3000, 5123, 2000])
         total = np.abs(maps.astype(np.int64) - wanted[:, None, None]).sum(axis=0)
         expected = (total < e1 * 1e4) & (maps != 65535).all(axis=0)
@@ -105,7 +108,7 @@ def test_pairs_follow_equation_4() -> None:
     theta = rng.uniform(-math.pi, math.pi, 50)
     row_start = np.searchsorted(new[:, 0], np.arange(61))
     pairs = np.empty((10000, 2), np.int32)
-    n = _follow_pairs(new[:, 0], new[:, 1], row_start, prev, start, theta, 12.0, 3.5, 10000, pairs)
+    n = follow_pairs(new[:, 0], new[:, 1], row_start, prev, start, theta, 12.0, 3.5, 10000, pairs)
     expected = set()
     for (p, (r, c)), k in itertools.product(enumerate(prev), (0, 1)):
         x, y = c + 12.0 * math.cos(theta[2 * p + k]), r - 12.0 * math.sin(theta[2 * p + k])
@@ -223,21 +226,16 @@ def test_no_place_exceeds_the_bound_of_its_ratio_feature(seed: int, monkeypatch:
 def test_tiers_equal_bayes_where_all_is_scored_in_full(
     weight: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Belief, "FINE_LEAST", 10**9)
-    monkeypatch.setattr(Belief, "FINE_MOST", 10**9)
+    monkeypatch.setattr("brmgeo.match.search.FINE_LEAST", 10**9)
+    monkeypatch.setattr("brmgeo.match.search.FINE_MOST", 10**9)
     monkeypatch.setattr(MaskTiers, "PRUNE", -math.inf)
     tiers, cover, _ = tiers_of(4, weight=weight)
     llr = dense_ratios(tiers, cover, 72)
     one, two = (Belief(cover.shape, BeliefSettings(keep=1e-9)) for _ in range(2))
-    for belief in (one, two):
-        # A second view upon the first: some ground is listed by then.
-        for k in range(2):
-            if belief is one:
-                gain = belief.search(lambda h: llr[h].copy(), -8.0, 25.0, weight)
-            else:
-                assert (
-                    belief.search_tiers(tiers, -8.0, 25.0, weight) == pytest.approx(gain, abs=1e-3) or k == 0
-                )
+    # A second view upon the first: some ground is listed by then.
+    for _ in range(2):
+        gain = search(one, lambda h: llr[h].copy(), -8.0, 25.0, weight)
+        assert search_tiers(two, tiers, -8.0, 25.0, weight) == pytest.approx(gain, abs=1e-3)
     np.testing.assert_allclose(dense(two), dense(one), rtol=2e-3, atol=1e-9)
     assert two.off == pytest.approx(one.off, rel=1e-3)
     assert two.rest == pytest.approx(one.rest, rel=1e-2, abs=1e-6)
@@ -245,12 +243,12 @@ def test_tiers_equal_bayes_where_all_is_scored_in_full(
 
 @pytest.mark.parametrize("seed", [5, 7, 8, 10])
 def test_tiers_find_what_a_full_search_finds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Belief, "FINE_LEAST", 0)
+    monkeypatch.setattr("brmgeo.match.search.FINE_LEAST", 0)
     tiers, cover, truth = tiers_of(seed)
     llr = dense_ratios(tiers, cover, 72)
     full, quick = (Belief(cover.shape, BeliefSettings()) for _ in range(2))
-    gain = full.search(lambda h: llr[h].copy(), -8.0, 25.0)
-    assert quick.search_tiers(tiers, -8.0, 25.0) == pytest.approx(gain, abs=0.1)
+    gain = search(full, lambda h: llr[h].copy(), -8.0, 25.0)
+    assert search_tiers(quick, tiers, -8.0, 25.0) == pytest.approx(gain, abs=0.1)
     assert quick.total() == pytest.approx(1.0, abs=1e-5)
     one, two = full.mode(8.0), quick.mode(8.0)
     assert one is not None
@@ -276,7 +274,7 @@ def test_yaws_unknown_are_averaged_over() -> None:
     np.testing.assert_allclose(got[0], got[1])
     np.testing.assert_allclose(got[0], expected[cover.blocks[1] + 1], atol=1e-3)
     belief = Belief(cover.shape, BeliefSettings(headings=36))
-    belief.search_tiers(free, -8.0, 25.0)
+    search_tiers(belief, free, -8.0, 25.0)
     whole = dense(belief)
     np.testing.assert_allclose(whole[0], whole[20], atol=1e-9)
     assert belief.total() == pytest.approx(1.0, abs=1e-5)
@@ -410,7 +408,7 @@ def small_belief(seed: int = 0, **changes: float) -> Belief:
     llr = rng.normal(-4, 1, (8, 70, 85)).astype(np.float32)
     llr[3, 30, 40] = 14
     llr[3, 33, 41] = 13
-    belief.search(lambda h: llr[h].copy(), -30.0, 25.0)
+    search(belief, lambda h: llr[h].copy(), -30.0, 25.0)
     return belief
 
 
@@ -418,7 +416,7 @@ def test_search_equals_bayes_on_the_whole_grid() -> None:
     rng = np.random.default_rng(9)
     llr = rng.normal(0, 2, (8, 70, 85))
     belief = Belief((70, 85), BeliefSettings(headings=8, keep=1e-9))
-    gain = belief.search(lambda h: llr[h].astype(np.float32), -30.0, 25.0)
+    gain = search(belief, lambda h: llr[h].astype(np.float32), -30.0, 25.0)
     expected = 0.5 / llr.size * np.exp(llr)
     total = expected.sum() + 0.5
     np.testing.assert_allclose(dense(belief), expected / total, rtol=2e-4)
@@ -433,7 +431,7 @@ def test_listed_update_equals_search_where_everything_is_listed() -> None:
     llr = rng.normal(0, 2, (8, 80, 96)).astype(np.float32)
     tiles = llr.reshape(8, 5, BLOCK, 6, BLOCK).transpose(0, 1, 3, 2, 4)
     one.update(np.ascontiguousarray(tiles[tuple(one.keys.T)]), -8.0, 25.0)
-    two.search(lambda h: np.ascontiguousarray(llr[h, :70, :85]), -8.0, 25.0)
+    search(two, lambda h: np.ascontiguousarray(llr[h, :70, :85]), -8.0, 25.0)
     np.testing.assert_allclose(dense(one), dense(two), rtol=1e-3, atol=1e-9)
     assert one.off == pytest.approx(two.off, rel=1e-3)
 
@@ -478,7 +476,7 @@ def test_belief_sums_to_one(operations: list[tuple[str, int]]) -> None:
         elif kind == "update":
             belief.update(rng.normal(-2, 6, belief.blocks.shape).astype(np.float32), -8.0, 25.0)
         elif kind == "search":
-            belief.search(lambda h, r=rng: r.normal(-2, 4, (50, 61)).astype(np.float32), -8.0, 25.0)
+            search(belief, lambda h, r=rng: r.normal(-2, 4, (50, 61)).astype(np.float32), -8.0, 25.0)
         else:
             belief.weigh_headings(rng.uniform(0.01, 2, 8))
         assert belief.total() == pytest.approx(1.0, abs=1e-4)
@@ -505,7 +503,7 @@ def test_unknown_motion_spreads_within_the_radius_only() -> None:
     belief = small_belief(4, leak_in=0.0)
     belief.update(np.where(belief.blocks == belief.blocks.max(), 0.0, -60.0).astype(np.float32), -50.0, 25.0)
     belief.off, belief.rest = 0.0, 0.0
-    belief._normalise()
+    belief.normalise()
     belief.predict_unknown(6.0, 0.0)
     marginal = dense(belief).sum(axis=0)
     rows, cols = np.nonzero(marginal > 1e-6)
@@ -563,7 +561,7 @@ def test_block_tridiagonal_solver_equals_dense() -> None:
     for i in range(1, n):
         below[i] = full[i * m : (i + 1) * m, (i - 1) * m : i * m]
     right = rng.normal(size=(n, m))
-    x, cov = _solve_tridiagonal(diag, below, right)
+    x, cov = solve_tridiagonal(diag, below, right)
     np.testing.assert_allclose(x.ravel(), np.linalg.solve(full, right.ravel()), atol=1e-8)
     inverse = np.linalg.inv(full)
     for i in range(n):
@@ -626,11 +624,11 @@ def test_values_refuse_nonsense() -> None:
         make_matcher("magic", GroundMap(np.ones((10, 10), np.uint8), 0, 0, 1.0))
 
 
-def test_chords_of_any_radius_are_finite_and_keep_the_area():
+def testchords_of_any_radius_are_finite_and_keep_the_area():
     # For the first ones r ** 2 (pow) is a bit less than r * r, which once made a root of a negative number.
     odd = [57.33697737834437, 31.09665930593685, 29.363052226938056, 1.5854919348047054, 38.64392663542872]
     for radius in [*odd, *np.random.default_rng(5).uniform(0.3, 60.0, 500)]:
-        _first, at, weight = _chords(float(radius), 5)
+        _first, at, weight = chords(float(radius), 5)
         assert np.isfinite(weight).all()
         ends = (
             weight[:, 0] * (at[:, 0, 1] * 5 + at[:, 0, 0]) + weight[:, 1] * (at[:, 1, 1] * 5 + at[:, 1, 0])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from brmgeo.flight.values import Motion
 from brmgeo.match import BeliefSettings, OdometrySettings
 from brmgeo.match.belief import Belief
+from brmgeo.match.search import search
 from brmgeo.match.smooth import Anchor, smooth_path
 
 N = 12
@@ -72,7 +73,7 @@ def test_a_cell_that_stands_out_under_many_headings_is_one_candidate() -> None:
     llr = np.random.default_rng(1).normal(-4, 1, (8, 70, 85)).astype(np.float32)
     llr[:, 30, 40] = 13
     llr[2:5, 33, 60] = 13
-    belief.search(lambda h: llr[h].copy(), -30.0, 25.0)
+    search(belief, lambda h: llr[h].copy(), -30.0, 25.0)
     centres, mass, count = belief.heaviest(2000)
     full = np.zeros((8, 80, 96), np.float32)
     for (h, i, j), block in zip(belief.keys, belief.blocks, strict=True):
