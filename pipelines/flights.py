@@ -31,6 +31,7 @@ from brmgeo.evaluate.report import ReportFigure, ReportTable, metrics_json, rend
 from brmgeo.evaluate.scores import FALSE_FIX_M, dead_reckoning, score, travelled_m
 from brmgeo.evaluate.sift import sift_fixes
 from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.own import odometry_name, own_odometry
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
 from brmgeo.geo.raster import read_overview
@@ -45,7 +46,6 @@ from brmgeo.match import METHODS, GroundMap, MatchSettings, SmoothedPath
 from brmgeo.region import FlightSettings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import serial_map
-from pipelines.odometry import odometry_name, own_odometry
 
 FloatArray = NDArray[np.float64]
 

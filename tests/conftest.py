@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import geopandas as gpd
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from affine import Affine
 from pyproj import Transformer
 from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, make_flight
 
+from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.match import METHODS
+from brmgeo.synth.flight import FlightSettings, Ground, Imagery, simulate
 from pipelines.cli import cli, run
 
 
@@ -109,6 +112,32 @@ def pictured(maps: Path, waypoints: Path, tmp_path_factory: pytest.TempPathFacto
     """A flight like ``whole`` with frames in place of masks; never change it."""
     out = tmp_path_factory.mktemp("pictured") / "f"
     return make_flight(maps, waypoints, out, "--mode", "frames", "--scale-bias", 0.03)
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of video frames over a plain with much to be seen on it, an IMU, and no odometry; never change it."""
+    rng = np.random.default_rng(0)
+    grey = sum(
+        w * cv2.GaussianBlur(rng.standard_normal((700, 700)).astype(np.float32), (0, 0), s)
+        for s, w in ((1.0, 1.0), (3.0, 3.0), (9.0, 8.0))
+    )
+    assert isinstance(grey, np.ndarray)
+    rgb = np.clip(128 + 45 * grey / grey.std(), 0, 255).astype(np.uint8)
+    imagery = Imagery(np.repeat(rgb[:, :, None], 3, axis=2), -140.0, 140.0, 0.4)
+    settings = FlightSettings(
+        camera=Camera.from_fov(240, 180, 43.0),
+        mount=Attitude(),
+        agl_m=100.0,
+        frame_interval_s=0.25,
+        odometry=None,
+        turn_radius_m=15.0,
+    )
+    path = np.array([[-50.0, -20.0], [20.0, -20.0], [20.0, 10.0]])
+    out = tmp_path_factory.mktemp("flight") / "f"
+    return simulate(
+        out, Ground.from_polygons([]), path, "EPSG:5187", settings, 1, mode="frames", imagery=imagery
+    )
 
 
 @pytest.fixture(scope="session")

@@ -13,8 +13,9 @@ import pytest
 from click.testing import CliRunner
 from PIL import ExifTags, Image
 
-from brmgeo.errors import FlightError
+from brmgeo import files
 from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.own import Embedded
 from brmgeo.flight.readings import Odometry
 from brmgeo.geo.crs import transformer
 from brmgeo.locate.live import motions_of
@@ -177,7 +178,7 @@ def test_import_says_what_it_leaves_out(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- odometry of the flight's own
 
 
-def made(flight: Flight, method: str = "auto") -> odometry.Embedded:
+def made(flight: Flight, method: str = "auto") -> Embedded:
     """What the filter might have made of a flight."""
     n = len(flight.frames)
     facts = {
@@ -187,23 +188,23 @@ def made(flight: Flight, method: str = "auto") -> odometry.Embedded:
     t = flight.times_s
     track = Odometry(t, np.stack([10.0 * t, 0 * t, 0 * t], -1), np.tile([1.0, 0, 0, 0], (n, 1)), "embedded")
     track = replace(track, walk_m2=0.01 * t)
-    return odometry.Embedded(track, 0 * t, np.ones(n, np.int64), np.zeros(n, np.bool_), facts)
+    return Embedded(track, 0 * t, np.ones(n, np.int64), np.zeros(n, np.bool_), facts)
 
 
 def test_a_killed_run_is_mended_by_the_next(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry, "estimate", made)
-    replaced = odometry._replace
+    replaced = files.write_bytes
     before = (folder / "flight.toml").read_text()
     for again in (False, True):  # a first run, and one over a track that is there
         for killed in range(4):
             left = killed
 
-            def replace_some(path: Path, text: str) -> None:
+            def replace_some(path: Path, data: bytes, *, durable: bool = False) -> None:
                 nonlocal left
                 if not left:
                     raise KeyboardInterrupt
                 left -= 1
-                replaced(path, text)
+                replaced(path, data, durable=durable)
 
             if again:
                 odometry.make_odometry(folder)
@@ -213,7 +214,7 @@ def test_a_killed_run_is_mended_by_the_next(folder: Path, monkeypatch: pytest.Mo
                     path.unlink()
                 (folder / "flight.toml").write_text(before)
             with monkeypatch.context() as context:
-                context.setattr(odometry, "_replace", replace_some)
+                context.setattr(files, "write_bytes", replace_some)
                 if not (again and killed == 3):  # flight.toml is not written again
                     with pytest.raises(KeyboardInterrupt):
                         odometry.make_odometry(folder)
@@ -224,23 +225,6 @@ def test_a_killed_run_is_mended_by_the_next(folder: Path, monkeypatch: pytest.Mo
             assert found is not None
             assert found.walk_m2 == pytest.approx([0.0, 0.01, 0.02, 0.03])
             assert (folder / "flight.toml").read_text().count("[odometry]") == 1
-
-
-def test_what_the_filter_found_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(odometry, "estimate", made)
-    (folder / "imu.csv").write_text("t_s,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n")
-    flight = read_flight(folder)
-    flight = replace(flight, frames=tuple(replace(f, t_s=f.t_s / 2) for f in flight.frames))
-    assert "differ from the IMU's by +80 ms" in odometry.own_odometry(flight, 5.0).says
-
-
-def test_one_reading_is_no_imu(folder: Path) -> None:
-    (folder / "imu.csv").write_text("t_s,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n")
-    flight = read_flight(folder)
-    imu = flight.imu()
-    assert imu is not None
-    with pytest.raises(FlightError, match=r"imu\.csv: 1 reading"):
-        odometry.checked_imu(imu, folder / "imu.csv", flight.times_s)
 
 
 def test_a_thinned_flight_is_there_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

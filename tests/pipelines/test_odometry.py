@@ -1,59 +1,27 @@
-"""``brmgeo odometry``: a flight folder without odometry gets one, that every reader reads; bad IMUs are named."""
+"""``brmgeo odometry``: a flight folder without odometry gets one, that every reader reads."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import rasterio
-from numpy.typing import NDArray
 from pyproj import Transformer
 from small_maps import BOUNDS, SmallRegion, brmgeo
 
 from brmgeo.errors import FlightError, InputError
 from brmgeo.flight.folder import read_flight
 from brmgeo.flight.motion import motions
-from brmgeo.flight.readings import Attitude, Camera, Imu
-from brmgeo.synth.flight import FlightSettings, Ground, Imagery, simulate
-from pipelines.odometry import (
-    checked_imu,
-    make_odometry,
-    odometry_name,
-    own_odometry,
-    summary,
-    thin_flight,
-)
-
-CAMERA = Camera.from_fov(240, 180, 43.0)
-
-
-def _imagery() -> Imagery:
-    rng = np.random.default_rng(0)
-    grey = sum(
-        w * cv2.GaussianBlur(rng.standard_normal((700, 700)).astype(np.float32), (0, 0), s)
-        for s, w in ((1.0, 1.0), (3.0, 3.0), (9.0, 8.0))
-    )
-    assert isinstance(grey, np.ndarray)
-    rgb = np.clip(128 + 45 * grey / grey.std(), 0, 255).astype(np.uint8)
-    return Imagery(np.repeat(rgb[:, :, None], 3, axis=2), -140.0, 140.0, 0.4)
+from pipelines.odometry import make_odometry, summary, thin_flight
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    settings = replace(
-        FlightSettings(camera=CAMERA, agl_m=100.0, frame_interval_s=0.25, odometry=None, turn_radius_m=15.0),
-        mount=Attitude(),
-    )
-    path = np.array([[-50.0, -20.0], [20.0, -20.0], [20.0, 10.0]])
-    out = tmp_path_factory.mktemp("flight") / "f"
-    return simulate(
-        out, Ground.from_polygons([]), path, "EPSG:5187", settings, 1, mode="frames", imagery=_imagery()
-    )
+def folder(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(filmed, tmp_path_factory.mktemp("flight") / "f"))
 
 
 def test_a_flight_without_odometry_gets_one(folder: Path, tmp_path: Path) -> None:
@@ -102,58 +70,6 @@ def test_planar_needs_no_imu(folder: Path, tmp_path: Path) -> None:
     assert facts["method"] == "planar"
     assert facts["segments"] == 1
     assert facts["length_m"] == pytest.approx(95.0, rel=0.1)
-
-
-def _bare(folder: Path, out: Path) -> Path:
-    """The flight as it came, without odometry."""
-    shutil.copytree(folder, out)
-    for path in out.glob("odometry.*"):
-        path.unlink()
-    toml = out / "flight.toml"
-    toml.write_text(toml.read_text().split("[odometry]")[0])
-    return out
-
-
-def test_localize_makes_odometry_where_there_is_none(folder: Path, tmp_path: Path) -> None:
-    bare = _bare(folder, tmp_path / "bare")
-    flight = read_flight(bare)
-    before = sorted(p.name for p in bare.iterdir())
-    got = own_odometry(flight, 5.0)
-    assert got.says.startswith("made from the frames: embedded visual-inertial odometry, ")
-    assert f"every 5 s one of its {len(flight.frames)} frames" in got.says
-    assert [f.t_s for f in got.flight.frames] == [0.0, 5.0, 10.0, 15.0]
-    assert got.flight.odometry is not None
-    assert len(got.flight.odometry.t_s) == len(flight.frames)
-    steps = motions(got.flight.odometry, got.flight.times_s)
-    assert all(m.step_m is not None and 15.0 < np.hypot(*m.step_m) < 30.0 for m in steps[1:])
-    assert odometry_name(got.flight, "simulated") == got.says
-    assert sorted(p.name for p in bare.iterdir()) == before
-    assert own_odometry(got.flight, 5.0).flight is got.flight
-    assert odometry_name(flight, "simulated") == "none"
-
-    # Readings in g: said, and the flight goes on without.
-    rows = np.loadtxt(bare / "imu.csv", delimiter=",", skiprows=1)
-    rows[:, 4:] /= 9.80665
-    np.savetxt(bare / "imu.csv", rows, "%.6f", ",", header="t_s,gx,gy,gz,ax,ay,az", comments="")
-    wrong = own_odometry(read_flight(bare), 5.0)
-    assert "are in g" in wrong.says
-    assert wrong.flight.odometry is None
-    assert len(wrong.flight.frames) == len(flight.frames)
-
-
-def test_odometry_of_frames_far_apart(folder: Path, tmp_path: Path) -> None:
-    few = thin_flight(_bare(folder, tmp_path / "bare"), tmp_path / "few", 2.5)
-    got = own_odometry(read_flight(few), 5.0)
-    assert got.says.startswith("made from the frames: embedded planar odometry, ")
-    assert len(got.flight.frames) == 8
-    assert got.flight.odometry is not None
-    rng = np.random.default_rng(5)
-    for path in (few / "frames").iterdir():
-        noise = rng.integers(0, 255, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
-        cv2.imwrite(str(path), noise)
-    alone = own_odometry(read_flight(few), 5.0)
-    assert "do not overlap" in alone.says
-    assert alone.flight.odometry is None
 
 
 def test_from_simulated_frames_to_a_report_with_no_odometry_given(
@@ -209,29 +125,3 @@ def test_from_simulated_frames_to_a_report_with_no_odometry_given(
     assert said.status == 0, said.err
     assert "made from the frames" not in said.err
     assert json.loads((tmp_path / "none" / "metrics.json").read_text())["odometry"] == "none"
-
-
-def _still(n: int = 200) -> Imu:
-    accel: NDArray[np.float64] = np.tile([0.1, 0.0, 9.8], (n, 1))
-    return Imu(np.arange(n) * 0.05, np.zeros((n, 3)), accel)
-
-
-def test_bad_imus_are_named() -> None:
-    path, times = Path("imu.csv"), np.array([0.5, 9.0])
-    imu = _still()
-    assert checked_imu(imu, path, times) is imu
-    spin = np.zeros((200, 3))
-    spin[::20] = 30.0
-    later = Imu(imu.t_s + 100.0, imu.gyro_rad_s, imu.accel_m_s2)
-    hole = np.where(imu.t_s > 4.0, imu.t_s + 2.0, imu.t_s)
-    cases = [
-        (replace(imu, accel_m_s2=imu.accel_m_s2 / 9.8), "in g"),
-        (replace(imu, accel_m_s2=imu.accel_m_s2 * 3.28), "check the unit"),
-        (replace(imu, accel_m_s2=imu.accel_m_s2 * [1, -1, -1]), "turn the signs"),
-        (replace(imu, gyro_rad_s=spin), "degrees"),
-        (later, "one clock"),
-        (replace(imu, t_s=hole), "no reading for"),
-    ]
-    for bad, words in cases:
-        with pytest.raises(FlightError, match=words):
-            checked_imu(bad, path, times)
