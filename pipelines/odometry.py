@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brmgeo.errors import InputError
 from brmgeo.files import whole_folder, write_text
@@ -36,7 +37,7 @@ def make_odometry(flight_dir: Path, method: Method = "auto") -> dict[str, Any]:
     made = estimate(flight, method)
     facts = made.facts | {"track": f"{stem}.tum", "covariance": f"{stem}.covariance.csv"}
     write_text(flight_dir / f"{stem}.json", json.dumps(facts, indent=1) + "\n")
-    columns = {
+    columns: dict[str, NDArray[Any]] = {
         "yaw_sigma_deg": np.round(np.degrees(made.yaw_sigma_rad), 4),
         "tracks": made.tracks,
         "blind": made.blind,
