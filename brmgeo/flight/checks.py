@@ -8,17 +8,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.flight.frames import inverse, multiply
-from brmgeo.flight.motion import breaks
+from brmgeo.flight.motion import RESET_SPEED_M_S, breaks
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 
 #: Correlation of two turn rates from which their lag is believed.
 MIN_CORRELATION = 0.6
 #: Rest lies within these of standard gravity; a handheld or flying one too, in the median.
-_GRAVITY = {"m/s2": 9.80665, "g": 1.0, "mg": 1000.0}
+_GRAVITY = {"m/s2": GRAVITY_M_S2, "g": 1.0, "mg": 1000.0}
 
 
-def length_m(odometry: Odometry, max_gap_s: float = 1.0, max_speed_m_s: float = 60.0) -> float:
+def length_m(odometry: Odometry, max_gap_s: float = 1.0, max_speed_m_s: float = RESET_SPEED_M_S) -> float:
     """Length of a track in metres, without what lies across its gaps and resets."""
     starts, _ = breaks(odometry, max_gap_s, max_speed_m_s)
     steps = np.linalg.norm(np.diff(odometry.xyz_m, axis=0), axis=1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from brmgeo.flight.readings import FloatArray
 
@@ -78,12 +79,8 @@ def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
 
 def quaternion_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:
     """(..., 4) quaternion of Rz(yaw) Ry(pitch) Rx(roll): intrinsic yaw-pitch-roll, in FLU and in FRD alike."""
-    r, p, y = (np.asarray(a, dtype=np.float64) / 2.0 for a in (roll_rad, pitch_rad, yaw_rad))
-    zero = np.zeros(np.broadcast_shapes(r.shape, p.shape, y.shape))
-    about_z = np.stack([np.cos(y) + zero, zero, zero, np.sin(y) + zero], axis=-1)
-    about_y = np.stack([np.cos(p) + zero, zero, np.sin(p) + zero, zero], axis=-1)
-    about_x = np.stack([np.cos(r) + zero, np.sin(r) + zero, zero, zero], axis=-1)
-    return multiply(multiply(about_z, about_y), about_x)
+    angles = np.stack(np.broadcast_arrays(yaw_rad, pitch_rad, roll_rad), axis=-1)
+    return np.asarray(Rotation.from_euler("ZYX", angles).as_quat()[..., [3, 0, 1, 2]])
 
 
 def euler_from_quaternion(wxyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

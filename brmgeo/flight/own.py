@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.errors import FlightError
 from brmgeo.flight.folder import MADE_BY, Flight, is_own_odometry
 from brmgeo.flight.planar import run_planar
@@ -62,7 +63,7 @@ def checked_imu(imu: Imu, path: Path, times_s: FloatArray) -> Imu:
     size = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
     if 0.8 < size < 1.25:
         raise FlightError(
-            f"{path}: accelerations of {size:.2f} at rest are in g: multiply them by 9.80665 (m/s2)"
+            f"{path}: accelerations of {size:.2f} at rest are in g: multiply them by {GRAVITY_M_S2} (m/s2)"
         )
     if not 8.0 < size < 12.0:
         raise FlightError(f"{path}: accelerations of {size:.2f} m/s2 (median), not about 9.8: check the unit")

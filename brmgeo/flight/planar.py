@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.flight.camera import level_from_camera, ray_from_pixel
+from brmgeo.flight.frames import quaternion_from_euler
+from brmgeo.flight.motion import RESET_SPEED_M_S
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Odometry
 
 
@@ -44,7 +46,7 @@ class PlanarSettings:
     keyframe_share: float = 0.15
     attitude_sigma_rad: float = math.radians(0.3)
     min_interval_s: float = 0.5
-    max_speed_m_s: float = 60.0
+    max_speed_m_s: float = RESET_SPEED_M_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +184,7 @@ def run_planar(
         if key is None or not joined or np.hypot(*(shot.place - key.place)) > s.keyframe_share * agl_m[row]:
             key, walk_key = shot, walk
     at = np.array(rows, dtype=np.int64)
-    quaternions = np.array([_wxyz(roll_rad[r], pitch_rad[r], y) for r, y in zip(rows, yaws)])
+    quaternions = quaternion_from_euler(np.asarray(roll_rad)[at], np.asarray(pitch_rad)[at], np.array(yaws))
     xyz = np.concatenate([np.array(places), np.asarray(agl_m)[at][:, None]], axis=1)
     odometry = Odometry(
         np.asarray(times_s)[at], xyz, quaternions, "embedded planar odometry", np.array(segments)
@@ -238,17 +240,3 @@ def _join(
     # What levelling errs in either frame moves the point below the camera; matches err a little each, and together.
     variance = 2.0 * (agl_m * s.attitude_sigma_rad) ** 2 + spread / count + (0.1 * tolerance) ** 2
     return angle, shift, count, variance
-
-
-def _wxyz(roll: float, pitch: float, yaw: float) -> FloatArray:
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )

@@ -16,6 +16,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import disc_radii
 from brmgeo.flight.camera import (
     border_pixels,
     ground_from_pixel,
@@ -151,25 +152,11 @@ def make_view(
     if not (math.isfinite(agl_m) and agl_m > 0 and math.isfinite(gsd_m) and gsd_m > 0):
         raise ValueError(f"height {agl_m} m and GSD {gsd_m} m must be positive")
     rotation = level_from_camera(mount, roll_rad, pitch_rad)
-    rays, max_r2 = _rays(camera)
-
-    focal = max(camera.fx, camera.fy)
-    frame_gsd = agl_m / focal
+    frame_gsd = agl_m / max(camera.fx, camera.fy)
     cos2 = frame_gsd / (max_stretch * max(gsd_m, frame_gsd))
     max_tan = min(math.tan(math.radians(max_off_nadir_deg)), math.sqrt(max(1.0 / cos2 - 1.0, 0.0)))
     reach = min(agl_m * max_tan, math.inf if max_radius_m is None else max_radius_m)
-
-    level = rays @ rotation.T
-    flat = np.hypot(level[:, 0], level[:, 1])
-    # A ray above the limit still bounds the view: in its direction the view ends at the reach.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.where(level[:, 2] < 0, agl_m * flat / -level[:, 2], np.inf)
-    distance = np.minimum(distance, reach)
-    points = level[:, :2] / np.where(flat > 0, flat, 1.0)[:, None] * distance[:, None]
-    (f0, s0), (f1, s1) = points.min(axis=0), points.max(axis=0)
-    top, left = math.ceil(f1 / gsd_m - 1e-9), math.ceil(s1 / gsd_m - 1e-9)
-    rows = max(1, top - math.floor(f0 / gsd_m + 1e-9))
-    cols = max(1, left - math.floor(s0 / gsd_m + 1e-9))
+    top, left, rows, cols = _extent(camera, rotation, agl_m, gsd_m, reach)
 
     scale = 1.0
     if image.dtype == np.uint8:
@@ -180,20 +167,20 @@ def make_view(
     building = np.empty((rows, cols), dtype=np.float32)
     known = np.empty((rows, cols), dtype=np.bool_)
     _resample(
-        np.ascontiguousarray(image),
-        scale,
-        rotation,
-        float(agl_m),
-        (camera.fx, camera.fy, camera.cx, camera.cy),
-        camera.distortion,
-        max_r2 * 1.0001,
-        reach * reach,
-        top * gsd_m,
-        left * gsd_m,
-        float(gsd_m),
-        samples,
-        building,
-        known,
+        image=np.ascontiguousarray(image),
+        scale=scale,
+        rot=rotation,
+        agl=float(agl_m),
+        lens=(camera.fx, camera.fy, camera.cx, camera.cy),
+        bend=camera.distortion,
+        max_r2=_rays(camera)[1] * 1.0001,
+        reach2=reach * reach,
+        top=top * gsd_m,
+        left=left * gsd_m,
+        gsd=float(gsd_m),
+        samples=samples,
+        out=building,
+        known=known,
     )
     return View(
         t_s=t_s,
@@ -205,6 +192,24 @@ def make_view(
         radius_m=agl_m * camera.half_fov_tan,
         file=file,
     )
+
+
+def _extent(
+    camera: Camera, rotation: FloatArray, agl_m: float, gsd_m: float, reach_m: float
+) -> tuple[int, int, int, int]:
+    # The nadir's row and column in the view, and its rows and columns: all of the ground that the frame shows in reach.
+    level = _rays(camera)[0] @ rotation.T
+    flat = np.hypot(level[:, 0], level[:, 1])
+    # A ray above the limit still bounds the view: in its direction the view ends at the reach.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where(level[:, 2] < 0, agl_m * flat / -level[:, 2], np.inf)
+    distance = np.minimum(distance, reach_m)
+    points = level[:, :2] / np.where(flat > 0, flat, 1.0)[:, None] * distance[:, None]
+    (f0, s0), (f1, s1) = points.min(axis=0), points.max(axis=0)
+    top, left = math.ceil(f1 / gsd_m - 1e-9), math.ceil(s1 / gsd_m - 1e-9)
+    rows = max(1, top - math.floor(f0 / gsd_m + 1e-9))
+    cols = max(1, left - math.floor(s0 / gsd_m + 1e-9))
+    return top, left, rows, cols
 
 
 def lowered(
@@ -255,7 +260,7 @@ def features(view: View, n: int = 3) -> Features:
     """
     if n < 1:
         raise ValueError(f"{n} discs asked for: give at least one")
-    radii = view.radius_m * np.arange(n, 0, -1) / n
+    radii = np.array(disc_radii(view.radius_m, n))
     row0, col0 = view.nadir_px
     rows, cols = view.building.shape
     dy2 = (np.arange(rows) + 0.5 - row0) ** 2

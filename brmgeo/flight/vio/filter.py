@@ -259,10 +259,23 @@ class VioFilter:
     def through_imu(self, p: FloatArray, v: FloatArray, rot: FloatArray, t0: float, t1: float) -> Any:
         """Position, velocity (3,) and attitude (3, 3) from IMU time ``t0`` to ``t1``, and what ``propagate`` gives more."""
         s, imu = self.settings, self.imu
-        noises = (s.gyro_noise, s.accel_noise, s.gyro_walk, s.accel_walk, s.ground_walk_m_sqrt_s)
-        readings = (imu.t_s, imu.gyro_rad_s, imu.accel_m_s2)
-        biases = (self.gyro_bias, self.accel_bias)
-        return propagate(p, v, rot, *biases, t0, t1, *readings, *(n**2 for n in noises))
+        return propagate(
+            p=p,
+            v=v,
+            rot=rot,
+            bg=self.gyro_bias,
+            ba=self.accel_bias,
+            t0=t0,
+            t1=t1,
+            it=imu.t_s,
+            gyro=imu.gyro_rad_s,
+            accel=imu.accel_m_s2,
+            qg=s.gyro_noise**2,
+            qa=s.accel_noise**2,
+            qbg=s.gyro_walk**2,
+            qba=s.accel_walk**2,
+            qz=s.ground_walk_m_sqrt_s**2,
+        )
 
     def advance(self, t: float) -> None:
         """Follow the IMU to its time ``t``; nothing where the filter is there already."""
@@ -384,14 +397,26 @@ class VioFilter:
         posterior = self.cov
         for turn in range(2):
             matrix, vector = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-            arguments = (self.p, self.rot, self.pk, self.rk, self.camera_mount, self.v, self.omega, key, seen)
-            miss = tie(*arguments, np.zeros(len(chosen)), matrix, vector)
+            state = {
+                "p": self.p,
+                "rot": self.rot,
+                "pk": self.pk,
+                "rotk": self.rk,
+                "rbc": self.camera_mount,
+                "vel": self.v,
+                "omega": self.omega,
+                "rays": key,
+                "seen": seen,
+                "matrix": matrix,
+                "vector": vector,
+            }
+            miss = tie(**state, weight=np.zeros(len(chosen)))
             miss = np.where(np.isfinite(miss), miss, 1e3)  # a ray that does not meet the ground
             weight, inliers = weigh(miss, base, self.focal, turn == 0)
             if inliers < s.min_tracks:
                 vars(self).update(prior)
                 return 0
-            tie(*arguments, weight, matrix, vector)
+            tie(**state, weight=weight)
             vector += matrix @ total
             gain = np.linalg.solve(np.eye(SIZE) + self.cov @ matrix, self.cov)
             total = gain @ vector
