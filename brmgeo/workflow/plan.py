@@ -107,7 +107,8 @@ class Plan:
                 errors.append(error)
         if len(errors) > 1:
             raise type(errors[0])(
-                f"{errors[0]} (and {len(errors) - 1} more of {len(steps)} {steps[0].stage.name} failed)"
+                f"{errors[0]} (and {len(errors) - 1} more of {len(steps)} {steps[0].stage.name} failed)",
+                needs=errors[0].needs,
             ) from errors[0]
         if errors:
             raise errors[0]
@@ -190,9 +191,7 @@ def _input_changes(name: str, before: Json, after: Json) -> list[str]:
     if "key" in after:
         if before.get("key") == after["key"]:
             return []
-        return [
-            f"input {name}: stage {after['label']} gives another result (brmgeo why tells for {after['label']})"
-        ]
+        return [f"input {name}: stage {after['label']} gives another result, for reasons of its own"]
     if before.get("sha256") == after["sha256"]:
         return []
     old, new = before.get("files"), after.get("files")

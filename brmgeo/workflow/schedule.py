@@ -64,7 +64,9 @@ def scheduler(
         return
     address = None if spec == "local" else spec
     if address is not None and (urlsplit(address).scheme not in ("tcp", "tls") or not _port(address)):
-        raise SettingsError(f"scheduler {spec!r}: give serial, local or an address such as tcp://host:8786")
+        raise SettingsError(
+            f"scheduler {spec!r}: give serial, local or an address such as tcp://host:8786", needs="scheduler"
+        )
     cluster = _Dask(
         address, Path(shared or tempfile.gettempdir()).absolute(), workers, say or (lambda line: None)
     )
@@ -112,7 +114,9 @@ class _Dask:
         except KilledWorker as error:
             raise WorkflowError(
                 f"{_name(function)}: {error.allowed_failures + 1} workers died one after another over the same item, "
-                f"most often for lack of memory; use smaller blocks or SCHEDULER=serial, see {self._shared / 'dask.log'}"
+                f"most often for lack of memory; use smaller blocks or the scheduler 'serial', see "
+                f"{self._shared / 'dask.log'}",
+                needs="scheduler",
             ) from None
         except (CancelledError, ClosedClientError, TimeoutError, OSError) as error:
             # An item's own errors pass; a connection that broke a moment before the client notices is the scheduler's end.
@@ -178,7 +182,8 @@ class _Dask:
             client = self._stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
         except (OSError, RuntimeError, TimeoutError) as error:
             raise WorkflowError(
-                f"the local Dask cluster does not start ({error}); run with SCHEDULER=serial, see {log}"
+                f"the local Dask cluster does not start ({error}); run with the scheduler 'serial', see {log}",
+                needs="scheduler",
             ) from error
         client.register_plugin(_quiet_worker(log))
         where = (
@@ -197,7 +202,8 @@ class _Dask:
         except OSError as error:
             raise WorkflowError(
                 f"scheduler {self._address} does not answer ({error.strerror or error}); start it with "
-                "`dask scheduler`, or leave SCHEDULER empty for this machine's own"
+                "`dask scheduler`, or take this machine's own",
+                needs="scheduler",
             ) from None
         from distributed import Client
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -273,21 +272,6 @@ def test_two_runs_at_once(region: SmallRegion, maps: Callable[[], Answer]) -> No
     with Store(region.data / "work").lock("small"):
         says(maps(), "small is being worked on by process", str(os.getpid()))
     assert maps().status == 0
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A tmpfs too small for the imagery."""
-    path = tmp_path / "disk"
-    path.mkdir()
-    mount = shutil.which("mount")
-    done = mount and subprocess.run(
-        [mount, "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(path)], capture_output=True, check=False
-    )
-    if not done or done.returncode != 0:
-        pytest.skip("a small disk cannot be mounted here (it takes root)")
-    yield path
-    subprocess.run(["umount", "-l", str(path)], check=True)
 
 
 def test_full_disk_under_the_store(

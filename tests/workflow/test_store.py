@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,21 +47,6 @@ trees = st.recursive(
     max_leaves=8,
 )
 settings_of_stages = st.dictionaries(st.text(max_size=5), trees, max_size=5)
-
-
-@pytest.fixture(autouse=True)
-def _no_calls() -> Iterator[None]:
-    toys.CALLS.clear()
-    yield
-    toys.CALLS.clear()
-
-
-@pytest.fixture
-def source(tmp_path: Path) -> Path:
-    path = tmp_path / "source.txt"
-    path.write_text("a bridge over the river\n")
-    os.utime(path, (1e9, 1e9))
-    return path
 
 
 @pytest.fixture
@@ -436,25 +421,6 @@ def test_litter_of_the_dead_goes_and_work_of_the_living_stays(store: Store) -> N
 
 
 # -- the disk
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A tmpfs of 2 MiB."""
-    path = tmp_path / "small"
-    path.mkdir()
-    mount = shutil.which("mount")
-    if mount is None:
-        pytest.skip("no mount command to make a small disk with")
-    done = subprocess.run(
-        [mount, "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(path)], capture_output=True, text=True
-    )
-    if done.returncode != 0:
-        pytest.skip(f"no small disk: {done.stderr.strip() or 'mount failed'} (it takes root)")
-    try:
-        yield path
-    finally:
-        subprocess.run(["umount", "-l", str(path)], check=True)
 
 
 def test_full_disk_is_one_line_and_leaves_nothing(small_disk: Path) -> None:
