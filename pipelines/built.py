@@ -8,8 +8,7 @@ from pathlib import Path
 from brmgeo.errors import SettingsError
 from brmgeo.locate.maps import read_maps
 from brmgeo.region import FlightSettings, Region
-from pipelines.flights import _safe as plain_name
-from pipelines.regions import region_named
+from pipelines.regions import region_named, safe_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +43,7 @@ def maps_for(
         )
     if maps_dir is not None:
         read_maps(maps_dir.absolute())
-        return BuiltMaps(plain_name(maps_dir.absolute().name), maps_dir, FlightSettings())
+        return BuiltMaps(safe_name(maps_dir.absolute().name), maps_dir, FlightSettings())
     assert region is not None
     own, data = region_named(region, data)
     folder = build_region(region, data, None, False, scheduler_spec)
