@@ -329,10 +329,9 @@ def train(
 ) -> None:
     """Train the U-Net by a recipe, and test it on REGION, which it never trains on. A killed run is taken up again."""
     from pipelines import network as job
+    from pipelines.regions import recipe_named
 
-    path = Path(recipe)
-    if path.suffix != ".toml":
-        path = data / "recipes" / f"{recipe}.toml"
+    path = recipe_named(recipe, data)
     folders: dict[str, Path] = {}
     for text in sources:
         name, sign, folder = text.partition("=")

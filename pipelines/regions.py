@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 MAX_AREA_M2 = 1e10
 NGII = "https://map.ngii.go.kr"
+#: Regions and recipes that ship: beside the wiring, in a checkout as in a wheel.
+SHIPPED = Path(__file__).parents[1] / "data"
 
 _TEXT = """\
 # Region {name}: see data/regions/_template.toml for every key that a region can have.
@@ -61,18 +63,30 @@ fov_deg = 43.0
 """
 
 
+def shipped(file: str, data: Path) -> Path:
+    """A file below ``data``, such as ``regions/demo.toml``; where it is not there, the one that ships under that name."""
+    own, beside = data / file, SHIPPED / file
+    return beside if not own.is_file() and beside.is_file() else own
+
+
 def region_named(name: str, data: Path) -> tuple[Region, Path]:
     """The region of that name (or of that TOML file) and the folder whose source/, work/ and out/ belong to it."""
     if name.endswith(".toml") or "/" in name:
         return load_region(Path(name)), data
-    return load_region(data / "regions" / f"{name}.toml"), data
+    return load_region(shipped(f"regions/{name}.toml", data)), data
+
+
+def recipe_named(name: str, data: Path) -> Path:
+    """The file of the recipe of that name (or that path)."""
+    return Path(name) if name.endswith(".toml") else shipped(f"recipes/{name}.toml", data)
 
 
 def described_regions(data: Path) -> Iterator[Region]:
-    """The regions of ``data``/regions; whoever asks for one with a faulty file is told then."""
-    for path in sorted((data / "regions").glob("[!_]*.toml")):
+    """The regions of ``data``/regions, and those that ship; whoever asks for one with a faulty file is told then."""
+    folders = (data / "regions", SHIPPED / "regions")
+    for name in sorted({path.name for folder in folders for path in folder.glob("[!_]*.toml")}):
         with suppress(SettingsError):
-            yield load_region(path)
+            yield load_region(shipped(f"regions/{name}", data))
 
 
 def flown_mark(name: str, data: Path) -> Path:

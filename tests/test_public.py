@@ -52,10 +52,8 @@ def test_all_public_names_work_without_the_extras() -> None:
 
 
 def test_what_is_not_installed_is_told_with_its_extra(tmp_path: Path) -> None:
-    code = (
-        BARE
-        + f"import sys\nsys.argv = ['brmgeo', 'maps', 'demo', '--data', {str(tmp_path)!r}]\nimport brmgeo.__main__ as m\nm.main()"
-    )
+    command = f"import sys; sys.argv = ['brmgeo', 'maps', 'demo', '--data', {str(tmp_path)!r}]"
+    code = f"{BARE}{command}\nfrom brmgeo.__main__ import main\nmain()"
     done = _python(code)
     assert done.returncode == 2, done.stderr
     assert "pip install 'brmgeo[maps]'" in done.stderr
