@@ -518,7 +518,7 @@ def simulate(
     "--maps",
     "maps_dir",
     type=DATA,
-    help="Folder of built maps (ratio.tif, buildings.tif), in place of REGION.",
+    help="Folder of built maps (buildings.tif), in place of REGION.",
 )
 @click.option(
     "--flight", type=DATA, help="The flight folder; with a REGION, a simulated flight where not given."
@@ -591,8 +591,10 @@ def localize(
     looks: int | None,
 ) -> None:
     """Locate a flight over REGION (or over --maps) and write fixes, paths, candidates, scores and a report."""
+    from brmgeo.files import plain_name
+    from brmgeo.flight.folder import read_flight
     from brmgeo.locate.masks import NetworkUse
-    from pipelines import flights as job
+    from pipelines import localize as job
     from pipelines.built import maps_for
     from pipelines.regions import note_flown
     from pipelines.simulate import default_flight
@@ -602,10 +604,10 @@ def localize(
         if built.region is None:
             raise SettingsError("localize --maps: give --flight, the folder of the flight")
         flight = default_flight(built.region, built.folder, data, seed)
-    if out is None:
-        if region is None:
-            raise SettingsError("localize --maps: give --out, the folder for the results")
-        out = data / "out" / built.name / "flights" / job.flight_name(flight) / method
+    if out is None and region is None:
+        raise SettingsError("localize --maps: give --out, the folder for the results")
+    flown = read_flight(flight)
+    out = out or data / "out" / built.name / "flights" / plain_name(flown.name, "flight") / method
     cache = data / "work" / "masks" if region is not None else out.absolute().parent / ".brmgeo-masks"
     own_use = NetworkUse()
     use = NetworkUse(
@@ -618,7 +620,7 @@ def localize(
     )
     job.localize(
         built.folder,
-        flight,
+        flown,
         method,
         out,
         flight_settings=built.flight,

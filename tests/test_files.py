@@ -75,6 +75,11 @@ def test_what_killed_runs_left_long_ago_is_cleared_away(tmp_path: Path) -> None:
     assert {*tmp_path.rglob("*")} == {deep, young, foreign}
 
 
+def test_a_name_for_people_becomes_one_for_files() -> None:
+    assert files.plain_name("대전 flight 3/4", "flight") == "대전-flight-3-4"
+    assert files.plain_name("../..", "flight") == "flight"
+
+
 def test_json_is_read_back_and_damage_is_none(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     files.write_json(path, {"가": [1, 2.5, None]}, durable=True)

@@ -20,7 +20,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from brmgeo.codes import BUILDING, UNKNOWN
-from brmgeo.flight.values import Estimate
+from brmgeo.flight.values import Estimate, View
+from brmgeo.match import GroundMap
 
 Extent = tuple[float, float, float, float]
 
@@ -175,6 +176,20 @@ class Seen:
     view: NDArray[np.float32]
     known: NDArray[np.bool_]
     ground: NDArray[np.uint8] | None
+
+
+def map_below(ground: GroundMap, view: View, xy: NDArray[np.float64], yaw_rad: float) -> NDArray[np.uint8]:
+    """(h, w) uint8 building map at each pixel of a view whose nadir is at ``xy``; 255 beyond the map."""
+    rows, cols = np.indices(view.building.shape) + 0.5
+    ahead, left = (view.nadir_px[0] - rows) * view.gsd_m, (view.nadir_px[1] - cols) * view.gsd_m
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    col = np.floor((xy[0] + ahead * c - left * s - ground.left) / ground.gsd_m).astype(np.int64)
+    row = np.floor((ground.top - xy[1] - ahead * s - left * c) / ground.gsd_m).astype(np.int64)
+    h, w = ground.building.shape
+    inside = (row >= 0) & (row < h) & (col >= 0) & (col < w)
+    out = np.full(view.building.shape, UNKNOWN, np.uint8)
+    out[inside] = ground.building[row[inside], col[inside]]
+    return out
 
 
 def seen_figure(frames: Sequence[Seen]) -> bytes:

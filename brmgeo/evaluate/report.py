@@ -123,9 +123,9 @@ def render_report(
 
 
 def metrics_json(scores: Scores, seconds_per_frame: float, names: dict[str, Any]) -> str:
-    """metrics.json of FLIGHT.md: the scores, seconds a frame, and the names of data, odometry and settings."""
-    values = asdict(scores) | {"seconds_per_frame": seconds_per_frame} | names
-    return json.dumps(_rounded(values), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    """metrics.json of FLIGHT.md: the scores, seconds a frame, and the names of data, odometry and settings, as they are."""
+    values = _rounded(asdict(scores) | {"seconds_per_frame": seconds_per_frame}) | names
+    return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _rounded(value: Any) -> Any:

@@ -127,16 +127,24 @@ def converged_track(estimates: Sequence[Estimate], z_m: NDArray[np.float64] | No
 
 
 def write_fixes(path: Path, estimates: Sequence[Estimate], files: Sequence[str], crs: str) -> Path:
-    """``fixes.csv``: one row a frame, columns as FLIGHT.md names them; ``path`` is returned.
+    """``fixes.csv``: ``FIXES_HEADER`` and the ``fixes_rows``; ``path`` is returned."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(FIXES_HEADER)
+    writer.writerows(fixes_rows(estimates, files, crs))
+    write_text(path, buffer.getvalue())
+    return path
+
+
+def fixes_rows(estimates: Sequence[Estimate], files: Sequence[str], crs: str) -> list[tuple[str, ...]]:
+    """One row of ``FIXES_HEADER`` a frame, as FLIGHT.md says.
 
     ``x, y, lon, lat`` are empty unless the status is converged; whatever is not known (NaN) is empty too. ``yaw_deg`` is
     counter-clockwise from east in [-180, 180), ``heading_deg`` clockwise from grid north in [0, 360).
     """
     track = converged_track(estimates)
     degrees = iter(lonlat(track.xy, crs)) if len(track.t_s) else iter(())
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(FIXES_HEADER)
+    rows = []
     for estimate, file in zip(estimates, files, strict=True):
         place = ["", "", "", ""]
         if estimate.position is not None:
@@ -144,20 +152,21 @@ def write_fixes(path: Path, estimates: Sequence[Estimate], files: Sequence[str],
             place = [f"{estimate.mean[0]:.3f}", f"{estimate.mean[1]:.3f}", f"{lon:.7f}", f"{lat:.7f}"]
         sigma = math.sqrt(max(float(np.trace(estimate.covariance)) / 2.0, 0.0))
         yaw, heading = _angles(estimate.yaw_rad)
-        row = [
-            _time(estimate.t_s),
-            file,
-            estimate.status,
-            *place,
-            _text(sigma, 3),
-            _text(yaw, 3),
-            _text(heading, 3),
-        ]
-        writer.writerow(
-            [*row, estimate.candidate_count, f"{estimate.mass:.6g}" if math.isfinite(estimate.mass) else ""]
+        mass = f"{estimate.mass:.6g}" if math.isfinite(estimate.mass) else ""
+        rows.append(
+            (
+                _time(estimate.t_s),
+                file,
+                estimate.status,
+                *place,
+                _text(sigma, 3),
+                _text(yaw, 3),
+                _text(heading, 3),
+                str(estimate.candidate_count),
+                mass,
+            )
         )
-    write_text(path, buffer.getvalue())
-    return path
+    return rows
 
 
 def write_path_geojson(

@@ -29,15 +29,19 @@ class Maps:
         g = self.ground
         return (g.left, g.top - rows * g.gsd_m, g.left + cols * g.gsd_m, g.top)
 
+    @property
+    def middle(self) -> tuple[float, float]:
+        """x and y of the map's middle, metres."""
+        left, bottom, right, top = self.bounds
+        return (left + right) / 2, (bottom + top) / 2
+
 
 def read_maps(folder: Path) -> Maps:
-    """The maps in a folder; MissingInputError where buildings.tif or ratio.tif is not there."""
-    for name in ("buildings.tif", "ratio.tif"):
-        if not (folder / name).is_file():
-            raise MissingInputError(
-                f"{folder / name} is not there; build the maps first (make maps REGION=..., or brmgeo maps)"
-            )
-    return _read_maps(folder, (folder / "buildings.tif").stat().st_mtime_ns)
+    """The maps in a folder; MissingInputError where buildings.tif is not there, InputError where it is no map."""
+    path = folder / "buildings.tif"
+    if not path.is_file():
+        raise MissingInputError(f"{path} is not there; build the maps first")
+    return _read_maps(folder, path.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=2)

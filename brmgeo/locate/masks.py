@@ -86,8 +86,7 @@ class FrameMasks:
         stored = _read_stored(self.files[index])
         if stored is None:
             raise InputError(f"{self.files[index]}: a mask that was kept is damaged or gone: run again")
-        probability = probability_of(stored)
-        return probability if self.threshold is None else mask_of(probability, self.threshold)
+        return network_image(stored, self.threshold)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,12 +191,13 @@ def network_mask(
 ) -> NDArray[Any]:
     """What ``FrameMasks`` would hand on of a (h, w, 3) RGB frame, on one processor thread, kept nowhere."""
     segmenter = _segmenter(weights, looks)
-    probability = probability_of(stored_of(segmenter.probability(picture, gsd_m)))
-    return (
-        probability
-        if NetworkUse().answer == "probability"
-        else mask_of(probability, segmenter.card.threshold)
-    )
+    return network_image(stored_of(segmenter.probability(picture, gsd_m)), segmenter.card.threshold)
+
+
+def network_image(stored: NDArray[np.uint8], threshold: float | None) -> NDArray[Any]:
+    """(h, w) of an answer as it is kept: uint8 0 or 255 by the threshold; without one, float32 probability."""
+    probability = probability_of(stored)
+    return probability if threshold is None else mask_of(probability, threshold)
 
 
 def slant_gsd_m(camera: Camera, mount: Attitude, roll_rad: float, pitch_rad: float, agl_m: float) -> float:

@@ -15,10 +15,13 @@ from PIL import ExifTags, Image
 
 from brmgeo import files
 from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.motion import motions
 from brmgeo.flight.own import Embedded
 from brmgeo.flight.readings import Odometry
+from brmgeo.flight.values import Motion
 from brmgeo.geo.crs import transformer
-from brmgeo.locate.live import motions_of
+from brmgeo.locate.localizer import usual_reset_speed_m_s
+from brmgeo.match import MatchSettings, OdometrySettings
 from pipelines import cli, odometry
 
 TOML = """name = "small"
@@ -51,14 +54,19 @@ def track(speed_m_s: float) -> Odometry:
     return Odometry(t, xyz, np.tile([1.0, 0.0, 0.0, 0.0], (31, 1)), "straight")
 
 
+def motions_of(flight: Flight, max_speed_m_s: float = 20.0) -> list[Motion]:
+    fastest = usual_reset_speed_m_s(MatchSettings(odometry=OdometrySettings(max_speed_m_s=max_speed_m_s)))
+    return motions(flight.odometry, flight.times_s, max_speed_m_s=fastest)
+
+
 def test_a_fast_aircraft_is_no_reset_where_its_speed_is_allowed(folder: Path) -> None:
     flight = replace(read_flight(folder), odometry=track(90.0))
     assert [m.step_m is None for m in motions_of(flight)] == [True] * 4
-    steps = motions_of(flight, None, 100.0)
+    steps = motions_of(flight, 100.0)
     assert [m.step_m is None for m in steps] == [True, False, False, False]
     slow = replace(flight, odometry=track(30.0))
     # A low bound is of movement without odometry: the track itself is believed up to what aircraft fly.
-    assert all(m.step_m is not None for m in motions_of(slow, None, 8.0)[1:])
+    assert all(m.step_m is not None for m in motions_of(slow, 8.0)[1:])
 
 
 def command(*arguments: object) -> tuple[int, str]:

@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +17,19 @@ import rasterio
 from pyproj import Transformer
 from small_flights import COLS, CRS, REAL, ROWS, Said, bytes_of, edit
 
+from brmgeo import files
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
-from brmgeo.locate.live import locate, motions_of, view_at
+from brmgeo.flight.motion import motions
+from brmgeo.locate.live import locate, locate_flight, view_at
 from brmgeo.locate.maps import match_settings, read_maps
-from brmgeo.match import METHODS, GroundMap, make_matcher
+from brmgeo.locate.masks import FrameMasks
+from brmgeo.match import METHODS, GroundMap, MatchSettings, make_matcher
 from brmgeo.match.likelihood import RateLearner
 from brmgeo.match.register import Registrar
 from brmgeo.region import FlightSettings
-from pipelines import flights as job
+from pipelines import flight_results
+from pipelines.localize import localize
 
 RESULTS = {
     "candidates.geojson", "candidates.qml", "trajectory.geojson", "trajectory.gpkg", "trajectory.tum", "trajectory.json",
@@ -146,7 +150,7 @@ def test_result_files_agree_with_each_other(whole: Path, results: Path, method: 
 
 def test_same_inputs_same_bytes(maps: Path, whole: Path, results: Path, tmp_path: Path) -> None:
     shutil.copytree(results / "mask", tmp_path / "a")
-    job.localize(maps, whole, "mask", tmp_path / "b")
+    localize(maps, read_flight(whole), "mask", tmp_path / "b")
     a, b = bytes_of(tmp_path / "a"), bytes_of(tmp_path / "b")
     assert a.keys() == b.keys()
     timed = {"metrics.json", "report.html"}
@@ -170,7 +174,8 @@ def test_live_matcher_and_folder_run_say_the_same(
     ground = read_maps(maps).ground
     flight = read_flight(whole)
     matcher = make_matcher(method, ground, match_settings(FlightSettings()))
-    for i, (motion, row) in enumerate(zip(motions_of(flight), rows, strict=True)):
+    steps = motions(flight.odometry, flight.times_s)
+    for i, (motion, row) in enumerate(zip(steps, rows, strict=True)):
         estimate = matcher.step(view_at(flight, ground.gsd_m, i), motion)
         assert estimate.status == row["status"]
         assert estimate.candidate_count == int(row["candidates"])
@@ -180,24 +185,57 @@ def test_live_matcher_and_folder_run_say_the_same(
             )
 
 
-def test_maps_need_only_two_files_and_reference_is_not_needed(
+def test_maps_need_only_one_file_and_reference_is_not_needed(
     maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said]
 ) -> None:
-    two = tmp_path / "two"
-    two.mkdir()
-    for name in ("buildings.tif", "ratio.tif"):
-        shutil.copy(maps / name, two)
+    one = tmp_path / "one"
+    one.mkdir()
+    shutil.copy(maps / "buildings.tif", one)
     (flight / "reference.csv").unlink()
     text = (flight / "flight.toml").read_text()
     (flight / "flight.toml").write_text(text[: text.index("[reference]")])
     out = tmp_path / "out"
-    said = say("localize", "--maps", two, "--flight", flight, "--out", out)
+    said = say("localize", "--maps", one, "--flight", flight, "--out", out)
     assert said.code == 0, said.err
     assert {p.name for p in out.iterdir()} == (RESULTS - {"metrics.json"}) | {"simulated-1.qgz"}
-    (two / "ratio.tif").unlink()
-    said = say("localize", "--maps", two, "--flight", flight, "--out", tmp_path / "none")
-    assert "ratio.tif is not there" in said.line
+    (one / "buildings.tif").unlink()
+    said = say("localize", "--maps", one, "--flight", flight, "--out", tmp_path / "none")
+    assert "buildings.tif is not there" in said.line
     assert not (tmp_path / "none").exists()
+
+
+def test_a_file_name_with_commas_shifts_no_column(maps: Path, flight: Path, tmp_path: Path) -> None:
+    rewrite_rows(flight / "frames.csv", lambda rows: rows[:2])
+    (flight / "masks" / "frame_00001.png").rename(flight / "masks" / "a, b, c.png")
+    edit(flight / "frames.csv", "frame_00001.jpg", '"a, b, c.jpg"')
+    localize(maps, read_flight(flight), "paper", tmp_path / "out")
+    with open(tmp_path / "out/fixes.csv", newline="") as handle:
+        rows = list(csv.reader(handle))
+    assert [row[1] for row in rows] == ["file", "frame_00000.jpg", "a, b, c.jpg"]
+    report = (tmp_path / "out/report.html").read_text()
+    cells = "".join(f"<td>{cell}</td>" for cell in rows[2])
+    assert cells in report
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_metrics_hold_all_settings_that_a_method_reads(
+    maps: Path, whole: Path, results: Path, method: str
+) -> None:
+    read: set[str] = set()
+
+    class Watched(MatchSettings):
+        def __getattribute__(self, name: str) -> object:
+            read.add(name)
+            return super().__getattribute__(name)
+
+    flight, own = read_flight(whole), match_settings(FlightSettings())
+    groups = {f.name: getattr(own, f.name) for f in fields(own)}
+    locate_flight(read_maps(maps), flight, FrameMasks(flight, ""), method=method, settings=Watched(**groups))
+    written = json.loads((results / method / "metrics.json").read_text())["settings"]
+    assert written.pop("localize") == {"compass": False, "roof_m": 0.0}
+    assert set(written) == read & set(groups)
+    for name, values in written.items():
+        assert values == asdict(groups[name]), "nothing is rounded: a result can be repeated"
 
 
 def test_reference_is_not_read_while_estimating(
@@ -206,7 +244,7 @@ def test_reference_is_not_read_while_estimating(
     shifted = [line.split(",") for line in (flight / "reference.csv").read_text().splitlines()]
     text = "\n".join(",".join([t, x if x == "x" else str(float(x) + 70), y]) for t, x, y in shifted)
     (flight / "reference.csv").write_text(text + "\n")
-    job.localize(maps, flight, "mask", tmp_path / "b")
+    localize(maps, read_flight(flight), "mask", tmp_path / "b")
     assert (results / "mask/fixes.csv").read_bytes() == (tmp_path / "b/fixes.csv").read_bytes()
     metrics = json.loads((tmp_path / "b/metrics.json").read_text())
     assert metrics["false_fixes"] > 0
@@ -223,7 +261,7 @@ def statuses(ground: GroundMap, flight_dir: Path, method: str) -> set[str]:
     flight = read_flight(flight_dir)
     views = [view_at(flight, ground.gsd_m, i) for i in range(len(flight.frames))]
     settings = match_settings(FlightSettings())
-    located = locate(ground, views, motions_of(flight), method, settings)
+    located = locate(ground, views, motions(flight.odometry, flight.times_s), method, settings)
     return {e.status for e in located.estimates}
 
 
@@ -338,7 +376,7 @@ def test_commands_refuse_what_cannot_be(
     common = ("localize", "--maps", maps, "--flight", flight, "--out", out)
     assert say(*common, "--method", "guess").code == 2
     with pytest.raises(SettingsError, match="METHOD 'guess'"):
-        job.localize(maps, flight, "guess", out)
+        localize(maps, read_flight(flight), "guess", out)
     rewrite_rows(flight / "frames.csv", lambda rows: [r[:5] for r in rows])
     edit(flight / "frames.csv", ",yaw_deg", "")
     assert "no column yaw_deg" in say(*common, "--compass").line
@@ -404,8 +442,7 @@ def test_results_are_replaced(results: Path, tmp_path: Path) -> None:
     ours = tmp_path / "ours"
     shutil.copytree(results / "paper", ours)
     (ours / "simulated-1.qgz~").write_bytes(b"of QGIS")
-    job._may_replace_results(ours)
-    job._may_replace_results(tmp_path / "new")
+    files.require_replaceable(ours, "fixes.csv", "results", flight_results.is_result)
 
 
 def test_sift_is_refused_where_it_cannot_be(
@@ -426,7 +463,7 @@ def test_the_caption_of_the_candidates_counts_what_is_drawn() -> None:
 
     def of(shown: int, count: int) -> str:
         places = np.zeros((shown, 2))
-        return job._how_many(
+        return flight_results.how_many(
             Estimate(
                 0.0, "ambiguous", places[0], np.eye(2), math.nan, math.nan, 0.1, places, np.ones(shown), count
             )
@@ -446,9 +483,9 @@ def test_a_crash_while_writing_leaves_the_old_results(
     def crash(*_: object, **__: object) -> str:
         raise OSError("disk on fire")
 
-    monkeypatch.setattr(job, "render_report", crash)
+    monkeypatch.setattr(flight_results, "render_report", crash)
     with pytest.raises(OSError, match="fire"):
-        job.localize(maps, whole, "mask", out)
+        localize(maps, read_flight(whole), "mask", out)
     assert bytes_of(out) == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 

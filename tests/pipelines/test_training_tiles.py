@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import geopandas as gpd
@@ -242,8 +243,8 @@ def test_flights_with_results_elsewhere_are_remembered(
     tiled: SmallRegion, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     region = tiled.copied_to(tmp_path / "data")
-    for name, value in {"localize": None, "flight_name": "f"}.items():
-        monkeypatch.setattr(f"pipelines.flights.{name}", lambda *args, value=value, **kw: value)
+    monkeypatch.setattr("pipelines.localize.localize", lambda *args, **kw: None)
+    monkeypatch.setattr("brmgeo.flight.folder.read_flight", lambda folder: SimpleNamespace(name="f"))
     words = ("localize", "small", "--data", region.data, "--flight", tmp_path)
     assert brmgeo(capsys, *words).status == 0
     require_trainable(load_region(region.toml), region.data)

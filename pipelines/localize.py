@@ -1,0 +1,96 @@
+"""A flight located over a region's maps: readings and masks in, the matchers' answers out, and all result files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.files import require_replaceable, whole_folder
+from brmgeo.flight.folder import Flight
+from brmgeo.flight.own import own_odometry
+from brmgeo.locate.live import locate_flight
+from brmgeo.locate.maps import match_settings, read_maps
+from brmgeo.locate.masks import NetworkUse, frame_masks
+from brmgeo.match import METHODS
+from brmgeo.region import FlightSettings
+from brmgeo.workflow.progress import Progress
+from brmgeo.workflow.schedule import serial_map
+from pipelines.flight_results import FlightResults, is_result, source_of, write_results
+
+
+def localize(
+    maps_dir: Path,
+    flight: Flight,
+    method: str,
+    out: Path,
+    *,
+    flight_settings: FlightSettings | None = None,
+    compass: bool = False,
+    sift: bool = False,
+    max_speed_m_s: float | None = None,
+    network: NetworkUse | None = None,
+    odometry: str = "auto",
+    attribution: str = "",
+) -> Path:
+    """Locates a flight over built maps and writes all its results into ``out``; returns the report's path.
+
+    A flight without odometry gets its own from its frames, where they are dense enough, unless ``odometry`` is "given".
+    ``out`` is replaced as a whole, at the end: a run that fails leaves what was there. ``max_speed_m_s`` bounds the
+    movement where odometry says nothing (default: the region's). ``network`` says where masks come from (default: the
+    flight's own where it has some, else the network that ships with brmgeo).
+    """
+    if method not in METHODS:
+        raise SettingsError(f"METHOD {method!r} is not known: choose one of {', '.join(METHODS)}")
+    require_replaceable(out, "fixes.csv", "results of localize", is_result)
+    progress = Progress()
+    maps = read_maps(maps_dir.absolute())
+    if sift and maps.imagery is None:
+        raise MissingInputError(
+            f"{maps.folder / 'imagery.tif'} is not there, and SIFT matches frames to imagery: do without it",
+            needs="sift",
+        )
+    if sift and not flight.has_images:
+        raise InputError(
+            f"{flight.folder / 'frames'}: the flight has masks only, and SIFT needs frames: do without it",
+            needs="sift",
+        )
+    own = flight_settings or FlightSettings()
+    if odometry == "auto":
+        tried = own_odometry(flight, own.interval_s)
+        flight = tried.flight
+        if tried.says:
+            progress.say(f"{flight.name} odometry: {tried.says}")
+    reference = flight.reference(maps.crs)
+    yaws = flight.compass_yaw_rad(maps.crs, *maps.middle) if compass else None
+    if yaws is not None and all(yaw is None for yaw in yaws):
+        raise InputError(
+            f"{flight.folder / 'frames.csv'}: a compass is to be trusted, but there is no column yaw_deg: add it, or do "
+            "without",
+            needs="compass",
+        )
+    if max_speed_m_s is not None:
+        own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
+    settings = match_settings(own)
+    given, use = f"{source_of(flight)}: masks/ of the flight folder", network or NetworkUse()
+    with frame_masks(flight, given, use, progress, maps.folder.name) as masks:
+        with progress.stage(f"{flight.name} {method}") as bar:
+            located = locate_flight(
+                maps, flight, masks, method=method, settings=settings, compass_yaw_rad=yaws,
+                each=bar.watch(serial_map),
+            )  # fmt: skip
+        results = FlightResults(
+            maps=maps,
+            masks=masks,
+            method=method,
+            settings=settings,
+            compass=compass,
+            located=located,
+            truth=None if reference is None else reference.at(flight.times_s),
+            sift=sift,
+            attribution=attribution,
+        )
+        with whole_folder(out) as scratch:
+            write_results(scratch, out, results)
+    report = out / "report.html"
+    progress.say(f"{flight.name} by {method}: {results.sentence}; report: {report}")
+    return report
