@@ -183,7 +183,7 @@ def sync(path: Path) -> None:
 
 
 def plain_name(text: str, otherwise: str) -> str:
-    """A text as the name of a file or folder: letters and digits of any script, - _ and .; ``otherwise`` where none is left."""
+    """A text as the name of a file or folder: letters and digits of any script, - _ .; ``otherwise`` where none is left."""
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in text).strip(".-") or otherwise
 
 
