@@ -179,9 +179,22 @@ class Belief:
             kx = step_kernels((moved - whole)[:, 1], sigma, reach)
             targets = self._reached(whole, reach)
             out = self._buffer(len(targets))
-            blocks, index, shape = self.blocks, self.index, self.shape
+            blocks, index, (ny, nx) = self.blocks, self.index, self.shape
             split(
-                lambda t0, t1: move_blocks(blocks, index, targets, whole, ky, kx, reach, *shape, out, t0, t1),
+                lambda t0, t1: move_blocks(
+                    blocks,
+                    index,
+                    targets,
+                    whole,
+                    ky=ky,
+                    kx=kx,
+                    reach=reach,
+                    ny=ny,
+                    nx=nx,
+                    out=out,
+                    t0=t0,
+                    t1=t1,
+                ),
                 len(targets),
                 200,
             )

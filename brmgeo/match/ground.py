@@ -239,7 +239,18 @@ class DiscAreas:
         sums = np.empty((len(discs), len(blocks), BLOCK, BLOCK), np.float32)
         flat, margin = prefix.reshape(-1), self.margin
         split(
-            lambda n0, n1: _disc_sums(flat, prefix.shape, at, weight, first, blocks, margin, sums, n0, n1),
+            lambda n0, n1: _disc_sums(
+                flat,
+                prefix.shape,
+                at,
+                weight,
+                first=first,
+                blocks=blocks,
+                shift=margin,
+                out=sums,
+                n0=n0,
+                n1=n1,
+            ),
             len(blocks),
             32,
         )

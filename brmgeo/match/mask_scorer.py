@@ -12,14 +12,8 @@ from numpy.typing import NDArray
 from brmgeo.flight.values import View
 from brmgeo.match.belief import Belief
 from brmgeo.match.ground import GroundMap
-from brmgeo.match.likelihood import (
-    MapCover,
-    MaskTiers,
-    RateLearner,
-    ViewPoints,
-    mask_templates,
-    view_points,
-)
+from brmgeo.match.mask import MapCover, MaskTiers, ViewPoints, mask_templates, view_points
+from brmgeo.match.rates import RateLearner
 from brmgeo.match.register import Registrar
 from brmgeo.match.search import search_tiers
 from brmgeo.match.settings import MatchSettings

@@ -180,7 +180,11 @@ class RingReach:
         starts, ends, counts, left = self._starts, self._ends, self._counts, self._left
         split(lambda i0, i1: _runs(mask, starts, ends, counts, i0, i1), len(counts), 64)
         split(
-            lambda i0, i1: _keep_reached(starts, ends, counts, spans, reach, out, left, i0, i1), len(left), 64
+            lambda i0, i1: _keep_reached(
+                starts, ends, counts, spans, reach, out=out, left=left, i0=i0, i1=i1
+            ),
+            len(left),
+            64,
         )
         return int(left.sum())
 
@@ -418,9 +422,17 @@ class PaperMatcher:
             turn = math.atan2(step[1], step[0]) - math.atan2(self._last_step[1], self._last_step[0])
         places, start = self._listed()
         n = follow_pairs(
-            places[:, 0], places[:, 1], start, self._places, self._theta_start, self._theta + turn, distance, eps,
-            len(self._pairs), self._pairs,
-        )  # fmt: skip
+            places[:, 0],
+            places[:, 1],
+            start,
+            self._places,
+            theta_start=self._theta_start,
+            theta=self._theta + turn,
+            distance=distance,
+            eps=eps,
+            limit=len(self._pairs),
+            pairs=self._pairs,
+        )
         if n < 0:
             self._places = None
             return -1

@@ -15,7 +15,8 @@ from brmgeo.maps.ratio import disc_counts
 from brmgeo.match.belief import Belief
 from brmgeo.match.ground import DiscAreas, GroundMap, disc_pixels
 from brmgeo.match.kernels import BLOCK
-from brmgeo.match.likelihood import Rates, Rings, cell_variance, ring_loglik, view_rings
+from brmgeo.match.rates import Rates
+from brmgeo.match.rings import Rings, cell_variance, ring_fit, ring_loglik, view_rings
 from brmgeo.match.search import search
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor
@@ -223,21 +224,3 @@ def gaussian_of(loglik: F64, x: F64, y: F64, prior: F64) -> tuple[F64, F64, F64]
     gain = np.maximum(gain, 1e-4)
     info = axes @ np.diag(gain) @ axes.T
     return np.linalg.solve(info, post @ mean), np.linalg.inv(info), mean
-
-
-def ring_fit(rings: Rings, built: NDArray[np.floating], known: NDArray[np.floating]) -> float:
-    """How far the building in a view's rings and in the map's agree, as Dice of areas, in [0, 1]; NaN for too little of it.
-
-    Args:
-        rings: of the view.
-        built, known: (n,) square metres of building and of known ground in the map's discs of the rings' radii.
-
-    At the true place it is about 0.95, at the best of all wrong places on a map of the same kind of town about 0.75
-    (docs/matchers.md); views with less than 2 % of building say nothing.
-    """
-    inside, seen = np.diff(built, prepend=0.0), np.diff(known, prepend=0.0)
-    share = np.divide(inside, seen, out=np.zeros(len(inside)), where=seen > 0)
-    area = np.where(seen > 0, rings.area_m2, 0.0)
-    if not area.sum() or float((rings.share * area).sum()) < 0.02 * float(area.sum()):
-        return math.nan
-    return 1.0 - float((np.abs(rings.share - share) * area).sum() / ((rings.share + share) * area).sum())

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
 from brmgeo.flight.values import View
 from brmgeo.match.ground import GroundMap, cell_shares
-from brmgeo.match.likelihood import Rates, ViewPoints, view_points
+from brmgeo.match.mask import ViewPoints, view_points
+from brmgeo.match.rates import Rates
 from brmgeo.match.threads import split
 
 F32 = NDArray[np.float32]
@@ -119,13 +120,13 @@ class Registrar:
         yaw = pose[2] + step * np.arange(-n, n + 1)
         reach = coarse.reach_m + (half + 2) * cell
         shares, origin = self._crop(pose[:2], reach, self._coarse_px)
-        score, at = self._scores(coarse, pose[:2], yaw, half, rates, shares, cell, origin)
+        score = self._scores(coarse, pose[:2], yaw, half, rates, shares, cell, origin)
         first, cov, edge = _moments(score, yaw, cell)
-        centre = pose[:2] + first[:2] + at
+        centre = pose[:2] + first[:2]
         # The fine window covers the coarse posterior and its pixels.
         spread = math.sqrt(max(cov[0, 0], cov[1, 1]))
         if edge or spread > 1.5 * cell:
-            return self._result(coarse, score, np.array([*centre, first[2]]), cov, edge, rates, cell)
+            return self._result(coarse, score, np.array([*centre, first[2]]), cov, edge)
         gsd = self._ground.gsd_m
         fine = view_points(view, max(gsd, 1.0))
         half = math.ceil(min(2.5 * spread + 0.5 * cell, 3.0 * cell) / gsd)
@@ -133,10 +134,10 @@ class Registrar:
         n = math.ceil(min(2.5 * math.sqrt(cov[2, 2]) + 0.5 * step, window_rad + step) / fine_step)
         yaw = first[2] + fine_step * np.arange(-n, n + 1)
         crop, origin = self._crop(centre, fine.reach_m + half * gsd + 2.0, 1)
-        score, at = self._scores(fine, centre, yaw, half, rates, crop, gsd, origin)
+        score = self._scores(fine, centre, yaw, half, rates, crop, gsd, origin)
         second, cov, edge = _moments(score, yaw, gsd)
-        place = centre + second[:2] + at
-        return self._result(fine, score, np.array([*place, second[2]]), cov, edge, rates, gsd)
+        place = centre + second[:2]
+        return self._result(fine, score, np.array([*place, second[2]]), cov, edge)
 
     def _crop(self, centre: F64, reach_m: float, cell_px: int) -> tuple[tuple[F32, F32], tuple[float, float]]:
         """Building and known shares of the map's cells of ``cell_px`` pixels about ``centre``, and the crop's (left, top).
@@ -164,8 +165,8 @@ class Registrar:
         shares: tuple[F32, F32],
         cell: float,
         origin: tuple[float, float],
-    ) -> tuple[F32, F64]:
-        """Ratios at (yaw, row, col) offsets, and the mean shift that cutting to whole pixels brings: none."""
+    ) -> F32:
+        """Ratios at (yaw, row, col) offsets."""
         a_k, a_o, b_k, b_o = rates.weights(points.rate)
         other = points.known - points.built
         a = (a_k * points.built + a_o * other).astype(np.float32)
@@ -180,33 +181,31 @@ class Registrar:
                 whole,
                 points.forward,
                 points.left,
-                a,
-                b,
-                row,
-                col,
-                1.0 / cell,
-                yaw,
-                half,
-                out,
-                h0,
-                h1,
+                a=a,
+                b=b,
+                row=row,
+                col=col,
+                per_m=1.0 / cell,
+                yaw=yaw,
+                half=half,
+                out=out,
+                h0=h0,
+                h1=h1,
             ),
             len(yaw),
             2,
         )
-        return out, np.zeros(2)
+        return out
 
-    def _result(
-        self, points: ViewPoints, score: F32, pose: F64, cov: F64, edge: bool, rates: Rates, cell: float
-    ) -> Registration:
+    def _result(self, points: ViewPoints, score: F32, pose: F64, cov: F64, edge: bool) -> Registration:
         top = float(score.max())
         return Registration(
-            pose,
-            cov + self._floor,
-            top,
-            top - float(np.median(score)),
-            self.counts(points, pose),
-            edge,
+            pose=pose,
+            covariance=cov + self._floor,
+            llr=top,
+            contrast=top - float(np.median(score)),
+            counts=self.counts(points, pose),
+            edge=edge,
         )
 
     def counts(self, points: ViewPoints, pose: F64) -> tuple[float, float, float, float]:

@@ -20,7 +20,7 @@ from brmgeo.match import (
     PaperSettings,
     make_matcher,
 )
-from brmgeo.match.likelihood import MapCover
+from brmgeo.match.mask import MapCover
 
 # Coarser than the defaults, so that the whole file takes seconds.
 QUICK = MatchSettings(belief=BeliefSettings(headings=72, cell_m=6.0))

@@ -26,20 +26,12 @@ from brmgeo.match import (
 from brmgeo.match.belief import Belief
 from brmgeo.match.ground import DiscAreas, chords, disc_pixels
 from brmgeo.match.kernels import BLOCK
-from brmgeo.match.likelihood import (
-    MapCover,
-    MaskTiers,
-    RateLearner,
-    Rates,
-    Rings,
-    mask_templates,
-    ring_loglik,
-    view_points,
-    view_rings,
-)
+from brmgeo.match.mask import MapCover, MaskTiers, mask_templates, view_points
 from brmgeo.match.paper import RingReach, follow_pairs, ring_spans
 from brmgeo.match.paper import search as search_pixels
+from brmgeo.match.rates import RateLearner, Rates
 from brmgeo.match.register import Registrar
+from brmgeo.match.rings import Rings, ring_loglik, view_rings
 from brmgeo.match.search import search, search_tiers
 from brmgeo.match.smooth import Anchor, smooth_path, solve_tridiagonal
 from brmgeo.match.track import Track

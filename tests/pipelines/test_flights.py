@@ -25,7 +25,7 @@ from brmgeo.locate.live import locate, locate_flight, view_at
 from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import FrameMasks
 from brmgeo.match import METHODS, GroundMap, MatchSettings, make_matcher
-from brmgeo.match.likelihood import RateLearner
+from brmgeo.match.rates import RateLearner
 from brmgeo.match.register import Registrar
 from brmgeo.region import FlightSettings
 from pipelines import flight_results

@@ -25,7 +25,7 @@ from brmgeo.flight.view import make_view
 from brmgeo.locate import masks as locating
 from brmgeo.locate.live import view_at
 from brmgeo.locate.maps import match_settings, read_maps
-from brmgeo.match.likelihood import RateLearner
+from brmgeo.match.rates import RateLearner
 from brmgeo.match.register import Registrar
 from brmgeo.region import FlightSettings
 from brmgeo.segment.predict import Answer, Segmenter

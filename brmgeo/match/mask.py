@@ -1,6 +1,6 @@
-"""Log-likelihood ratios of a view against a background: of its whole mask, and of its ratio rings.
+"""Log-likelihood ratios of a view's whole mask against a background, block by block, and over a whole map in three tiers.
 
-**Mask.** For a pose, c is the building share of a map cell under a patch of the view, m its known share, k the
+For a pose, c is the building share of a map cell under a patch of the view, m its known share, k the
 mask's building share and w its known share. A mask pixel is building with P1 over a mapped building and P0
 elsewhere; under the background, that this view has nothing to do with this place, with the view's own rate pb.
 A hypothesis is a cell, not a point: which pixel of the map lies under a mask pixel is open by about the cell's size, so
@@ -16,20 +16,12 @@ twice as large and headings twice as wide rank what is left, and the best of the
 Unknown ground and unseen pixels add nothing. Mask and map differ by whole buildings, so a patch counts as its area over
 the area that carries one independent observation. pb is kept within [P0, P1]: a blank view then says nothing in favour
 of any place, it only speaks against built-up ones.
-
-**Rings.** The ratios in n discs (eq. 1-3) are differenced into n rings, whose errors hardly depend on each
-other. A ring's share is expected at P0 + (P1-P0) G and scatters by missed and invented buildings, P(1-P) over
-the number of independent areas in the ring, by the position within a cell, and by a floor; a Student density
-keeps one odd ring from deciding. The background is the map's own distribution: the mean likelihood over all
-its cells, half and half with an even spread over rings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numba as nb
@@ -39,8 +31,7 @@ from numpy.typing import NDArray
 from brmgeo.flight.values import View
 from brmgeo.maps.ratio import Disjoint
 from brmgeo.match.kernels import BLOCK
-from brmgeo.match.settings import RateSettings, RatioSettings
-from brmgeo.match.state import State
+from brmgeo.match.rates import Rates
 from brmgeo.match.threads import split
 
 F32 = NDArray[np.float32]
@@ -99,85 +90,6 @@ def view_points(view: View, patch_m: float) -> ViewPoints:
     return ViewPoints(
         forward.astype(np.float32), left.astype(np.float32), built_sum[rows, cols], known_sum[rows, cols]
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Rates:
-    """P1, P0 and the area of one independent observation, as they are now."""
-
-    hit: float
-    false_alarm: float
-    independent_m2: float
-
-    def background(self, rate: float) -> float:
-        """pb of a view of this ``rate``: kept within [P0, P1]."""
-        return min(max(rate, self.false_alarm), self.hit)
-
-    def weights(self, rate: float) -> tuple[float, float, float, float]:
-        """Of points: the ratio is c a + m b, which is exact where c is 0 or 1 (between them it is the mean of two
-        logarithms, never above the logarithm of the mean); these are, per square metre, (a of building, a of other,
-        b of building, b of other) for a view of this ``rate``."""
-        p1, p0 = self.hit, self.false_alarm
-        pb = self.background(rate)
-        scale = 1.0 / self.independent_m2
-        return (
-            scale * math.log(p1 / p0),
-            scale * math.log((1 - p1) / (1 - p0)),
-            scale * math.log(p0 / pb),
-            scale * math.log((1 - p0) / (1 - pb)),
-        )
-
-
-class RateLearner:
-    """P1 and P0 from registered views: more careful than the settings where the views are worse, never more trusting.
-
-    Counts are kept in independent areas, so that one view weighs about as much as the buildings it shows; the
-    settings count as ``PRIOR`` such areas each, and old views fade.
-    """
-
-    PRIOR = 60.0
-    FADE = 0.98
-
-    def __init__(self, settings: RateSettings) -> None:
-        self._settings = settings
-        self._hits = np.array([settings.hit, 1.0 - settings.hit]) * self.PRIOR
-        self._alarms = np.array([settings.false_alarm, 1.0 - settings.false_alarm]) * self.PRIOR
-        self.rates = Rates(settings.hit, settings.false_alarm, settings.independent_m2)
-
-    def learn(self, built_on: float, other_on: float, built_off: float, other_off: float) -> None:
-        """Take in one registered view: square metres of building and other, over mapped buildings and elsewhere."""
-        if not self._settings.learn:
-            return
-        unit = self.rates.independent_m2
-        self._hits = self._hits * self.FADE + (1 - self.FADE) * self._prior(self._settings.hit)
-        self._alarms = self._alarms * self.FADE + (1 - self.FADE) * self._prior(self._settings.false_alarm)
-        self._hits += np.array([built_on, other_on]) / unit
-        self._alarms += np.array([built_off, other_off]) / unit
-        hit = float(self._hits[0] / self._hits.sum())
-        alarm = float(self._alarms[0] / self._alarms.sum())
-        # A map and masks that hardly agree must not talk the filter into believing anything.
-        hit = min(max(hit, 0.4), self._settings.hit)
-        alarm = max(min(alarm, 0.5 * hit), self._settings.false_alarm)
-        # Rates are kept until they have moved: the map's logarithms are kept for them.
-        if abs(hit - self.rates.hit) > 0.02 or abs(math.log(alarm / self.rates.false_alarm)) > 0.1:
-            self.rates = Rates(hit, alarm, unit)
-
-    def _prior(self, share: float) -> F64:
-        return np.array([share, 1.0 - share]) * self.PRIOR
-
-    def state(self) -> State:
-        """The counts and the rates as named arrays."""
-        return {
-            "hits": self._hits,
-            "alarms": self._alarms,
-            "rates": np.array([self.rates.hit, self.rates.false_alarm], np.float64),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take up what ``state`` gave."""
-        self._hits, self._alarms = state["hits"], state["alarms"]
-        hit, false_alarm = state["rates"].tolist()
-        self.rates = Rates(hit, false_alarm, self._settings.independent_m2)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -247,14 +159,14 @@ def mask_templates(
             points.left,
             points.built * unit,
             points.known * unit,
-            yaw_rad,
-            shown,
-            cell_m,
-            reach,
-            k,
-            w,
-            h0,
-            h1,
+            yaw=yaw_rad,
+            wanted=shown,
+            cell=cell_m,
+            reach=reach,
+            out_k=k,
+            out_w=w,
+            h0=h0,
+            h1=h1,
         ),
         len(yaw_rad),
         8 if shown.sum() > 16 else len(yaw_rad),
@@ -420,7 +332,9 @@ class MapCover:
         high = np.where(some, template.shape[2] - filled[:, :, ::-1].argmax(axis=2), 0)
         flat, first, heading = cover.reshape(-1), row * cols + col, keys[:, 0].astype(np.int64)
         split(
-            lambda t0, t1: _correlate_blocks(flat, cols, first, template, low, high, heading, out, t0, t1),
+            lambda t0, t1: _correlate_blocks(
+                flat, cols, first, template, low=low, high=high, heading=heading, out=out, t0=t0, t1=t1
+            ),
             len(keys),
             16,
         )
@@ -544,110 +458,4 @@ def _over_yaws(cover: MapCover, places: NDArray[np.int32], templates: MaskTempla
     for h in np.flatnonzero(log_weight > log_weight.max() - 15.0):
         keys = np.concatenate([np.full((len(places), 1), h), places], axis=1).astype(np.int32)
         np.logaddexp(total, cover.score_blocks(keys, templates) + np.float32(log_weight[h]), out=total)
-    return total
-
-
-@dataclass(frozen=True, slots=True)
-class Rings:
-    """Ring shares of a view: (n,) float64 ``share`` in [0, 1] and known area ``area_m2``, and the ``radius_m``
-    of the discs."""
-
-    share: F64
-    area_m2: F64
-    radius_m: F64
-
-
-def view_rings(view: View, count: int) -> Rings:
-    """Shares of building in ``count`` rings between the radii r_k = k / count of the view's largest disc (eq. 1-3).
-
-    A pixel belongs to a disc when its centre does; unknown pixels count in neither sum. A ring without known
-    pixels has area 0.
-    """
-    h, w = view.known.shape
-    row = (np.arange(h) + 0.5 - view.nadir_px[0]) * view.gsd_m
-    col = (np.arange(w) + 0.5 - view.nadir_px[1]) * view.gsd_m
-    ring = np.sqrt(row[:, None] ** 2 + col[None, :] ** 2) * (count / view.radius_m)
-    index = np.minimum(np.ceil(ring).astype(np.int64) - 1, count).clip(0)
-    known = view.known
-    n = np.bincount(index[known], minlength=count + 1)[:count].astype(np.float64)
-    k = np.bincount(index[known], weights=view.building[known].astype(np.float64), minlength=count + 1)[
-        :count
-    ]
-    share = np.divide(k, n, out=np.zeros(count), where=n > 0)
-    radius = view.radius_m * (np.arange(count) + 1) / count
-    return Rings(share, n * view.gsd_m**2, radius)
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, out, i0, i1):  # type: ignore[no-untyped-def]
-    """log p(rings | cell): (rows, cols) from (n, rows, cols) square metres of building and known ground in discs."""
-    n, _rows, cols = built.shape
-    # lgamma terms make densities of different widths comparable with the even spread of the background.
-    const = math.lgamma((dof + 1) / 2) - math.lgamma(dof / 2) - 0.5 * math.log(dof * math.pi)
-    for i in range(i0, i1):
-        for j in range(cols):
-            used = 0
-            # Products instead of sums of logarithms: at most 32 factors between 1e-7 and 1e6 stay in range.
-            spread = 1.0
-            apart = 1.0
-            for k in range(n):
-                if area[k] <= 0:
-                    continue
-                b, m = built[k, i, j], known[k, i, j]
-                if k:
-                    b -= built[k - 1, i, j]
-                    m -= known[k - 1, i, j]
-                if m < 0.5 * area[k]:
-                    # Ground that the map does not know: as good as the background's even spread.
-                    continue
-                g = b / m
-                p = alarm + (hit - alarm) * g
-                var = (g * hit * (1 - hit) + (1 - g) * alarm * (1 - alarm)) * unit / area[k]
-                var += floor * floor + move[k]
-                d = share[k] - p
-                spread *= var
-                apart *= 1.0 + d * d / (dof * var)
-                used += 1
-            out[i, j] = used * const - 0.5 * math.log(spread) - 0.5 * (dof + 1) * math.log(apart)
-
-
-def ring_loglik(
-    rings: Rings, built: F32, known: F32, rates: Rates, settings: RatioSettings, move: F64 | None = None
-) -> F32:
-    """log p(rings | place), (...) float32, for maps of the ground in the discs of the rings' radii.
-
-    Args:
-        rings: of the view.
-        built, known: (n, ..., cols) float32 square metres of building and of known ground in each disc.
-        rates: P1, P0 and the independent area.
-        settings: floor and degrees of freedom.
-        move: (n,) variance of each ring's ratio within what a place stands for (``cell_variance``), or None for points.
-    """
-    n, cols = len(built), built.shape[-1]
-    flat_built, flat_known = built.reshape(n, -1, cols), known.reshape(n, -1, cols)
-    more = np.zeros(n) if move is None else move
-    out = np.empty(flat_built.shape[1:], np.float32)
-    split(
-        lambda i0, i1: _ring_loglik(
-            flat_built, flat_known, rings.share, rings.area_m2,
-            rates.hit, rates.false_alarm, rates.independent_m2, settings.noise, more, settings.dof, out, i0, i1,
-        ),
-        len(out),
-        64,
-    )  # fmt: skip
-    return out.reshape(built.shape[1:])
-
-
-def cell_variance(built: F32, known: F32) -> F64:
-    """(n,) variance of each ring's ratio within a cell, from (n, ..., rows, cols) areas in discs about cells' centres.
-
-    A place is spread evenly over its cell: a twelfth of the variance between neighbouring cells, per axis.
-    """
-    ring_built = np.diff(built, axis=0, prepend=np.float32(0))
-    ring_known = np.diff(known, axis=0, prepend=np.float32(0))
-    share = np.divide(ring_built, ring_known, out=np.zeros_like(ring_built), where=ring_known > 0)
-    axes = tuple(range(1, share.ndim))
-    total = np.zeros(len(built))
-    for axis in (-2, -1):
-        total += (np.diff(share, axis=axis) ** 2).mean(axis=axes, dtype=np.float64) / 12.0
     return total
