@@ -76,7 +76,7 @@ def damaged(what: str) -> InputError:
 
 def _first_difference(given: NDArray[Any], own: NDArray[Any]) -> str:
     if own.ndim or own.dtype.kind != "U" or not str(own).startswith("{"):
-        return f"{given} there, {own} here"
+        return f"{given.tolist()} there, {own.tolist()} here"
     try:
         there, here = json.loads(str(given)), json.loads(str(own))
         for group, values in here.items():

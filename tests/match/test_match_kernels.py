@@ -24,11 +24,10 @@ from brmgeo.match import (
     make_matcher,
 )
 from brmgeo.match.belief import Belief
+from brmgeo.match.candidates import RingReach, follow_pairs, ring_spans, search_ratios
 from brmgeo.match.ground import DiscAreas, chords, disc_pixels
 from brmgeo.match.kernels import BLOCK
 from brmgeo.match.mask import MapCover, MaskTiers, mask_templates, view_points
-from brmgeo.match.paper import RingReach, follow_pairs, ring_spans
-from brmgeo.match.paper import search as search_pixels
 from brmgeo.match.rates import RateLearner, Rates
 from brmgeo.match.register import Registrar
 from brmgeo.match.rings import Rings, ring_loglik, view_rings
@@ -48,7 +47,7 @@ def test_search_equals_numpy() -> None:
     maps[1, 3, 4] = 65535
     out = np.empty((150, 70), np.uint8)
     for e1 in (0.05, 0.4, 2.9):
-        n = search_pixels(maps, np.array([0.3, 0.51234, 0.2]), e1, out)
+        n = search_ratios(maps, np.array([0.3, 0.51234, 0.2]), e1, out)
         wanted = np.array([3000, 5123, 2000])
         total = np.abs(maps.astype(np.int64) - wanted[:, None, None]).sum(axis=0)
         expected = (total < e1 * 1e4) & (maps != 65535).all(axis=0)
