@@ -13,7 +13,7 @@ from typing import Any
 from brmgeo.errors import MissingInputError, SettingsError
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.readings import Attitude, Camera
-from brmgeo.flight.tables import nearest
+from brmgeo.settings import nearest
 from brmgeo.synth.flight import FlightSettings, MaskErrors, OdometryErrors
 
 #: Least and most of a number; what is not named is 0 or more.

@@ -54,6 +54,8 @@ ADAPTERS = {
     "brmgeo.flight.odometry",
     "brmgeo.flight.poses",
     "brmgeo.flight.tables",
+    "brmgeo.flight.video",
+    "brmgeo.flight.write",
     "brmgeo.segment.shards",
     "brmgeo.segment.pairs",
 }

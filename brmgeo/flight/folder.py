@@ -6,14 +6,11 @@ reference is read only when it is asked for, by name, so nothing that estimates 
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import re
 import tomllib
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,12 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from brmgeo.errors import CrsError, FlightError
+from brmgeo.errors import CrsError, FlightError, InputError
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
-from brmgeo.flight.tables import Table, nearest, read_table, read_text, read_times, refuse
+from brmgeo.flight.tables import Table, read_table, read_times, refuse
+from brmgeo.flight.video import Video
 from brmgeo.geo.crs import LONLAT, convergence_rad, crs_name, parse_crs, transformer
+from brmgeo.pictures import decode, read_bytes
+from brmgeo.settings import nearest, read_toml
 
 MIN_AGL_M, MAX_AGL_M = 1.0, 5000.0
 MAX_ALTIMETER_GAP_S = 5.0
@@ -56,6 +56,9 @@ _KEYS: dict[str, dict[str, type]] = {
 class Flight:
     """One flight, checked.
 
+    Where its frames are a video, ``image`` opens it and keeps it open for the next frame: it is closed with the last frame,
+    by ``close``, or at the end of ``with read_flight(...) as flight``.
+
     Attributes:
         folder: where it lies.
         name: as its flight.toml says.
@@ -77,10 +80,9 @@ class Flight:
     has_masks: bool
     has_images: bool
     simulated: bool = False
-    _video: Path | None = None
+    _video: Video | None = None
     _video_start_s: float = 0.0
     _reference: tuple[Path, str | None] | None = None
-    _capture: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def times_s(self) -> FloatArray:
@@ -96,20 +98,15 @@ class Flight:
         """(height, width, 3) uint8 RGB of a frame; FlightError when it cannot be decoded or has another size."""
         frame = self.frames[index]
         if self._video is not None:
-            return self._video_image(frame)
+            return self._video_image(self._video, index)
         if not self.has_images:
             raise FlightError(
                 f"{self.folder / 'frames'}: {frame.file} is asked for, but this flight has masks only"
             )
         path = self.folder / "frames" / frame.file
-        # The sensor's own rows and columns: an EXIF turn would swap them under the calibration.
-        image = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            raise FlightError(
-                f"{path}: the image cannot be decoded, or is cut short: copy it again or remove its row from frames.csv"
-            )
+        image = _decoded(path, cv2.IMREAD_COLOR)
         _check_size(path, (image.shape[1], image.shape[0]), self.camera)
-        return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
+        return image.astype(np.uint8, copy=False)
 
     def mask(self, index: int) -> NDArray[np.uint8]:
         """(height, width) uint8 building mask of a frame: 0 other, 255 building.
@@ -120,8 +117,6 @@ class Flight:
         if not self.has_masks:
             raise FlightError(f"{path}: a mask is asked for, but this flight has no masks")
         image = _decoded(path, cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise FlightError(f"{path}: the mask cannot be decoded, or is cut short: write it again")
         if image.ndim == 3:
             if not (image[:, :, :3] == image[:, :, :1]).all():
                 raise FlightError(f"{path}: the mask is in colour: 0 is other, 255 is building, nothing else")
@@ -203,32 +198,30 @@ class Flight:
         _check_overlap(path, "reference", table.numbers["t_s"], self.times_s)
         return Reference(table.numbers["t_s"], xy, table.numbers.get("alt_m"), table.numbers.get("sigma_m"))
 
-    def _video_image(self, frame: Frame) -> NDArray[np.uint8]:
-        # Frames are counted by decoding: seeking lands on key frames in many files.
-        path = self._video
-        assert path is not None
-        capture, position = self._capture.get("capture"), self._capture.get("position", 0)
-        if capture is None:
-            capture, position = _open_video(path), 0
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        wanted = round((frame.t_s - self._video_start_s) * rate)
-        if wanted < position:
-            capture.release()
-            capture, position = _open_video(path), 0
-        ok, image = wanted >= 0, None
-        while ok and position <= wanted:
-            ok = capture.grab()
-            position += 1
-        if ok:
-            ok, image = capture.retrieve()
-        self._capture.update(capture=capture, position=position)
-        if not ok or image is None:
+    def close(self) -> None:
+        """Lets go of the video, where there is one; the next picture opens it again."""
+        if self._video is not None:
+            self._video.close()
+
+    def __enter__(self) -> Flight:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _video_image(self, video: Video, index: int) -> NDArray[np.uint8]:
+        frame = self.frames[index]
+        at_s = frame.t_s - self._video_start_s
+        image = video.image(round(at_s * video.rate_hz))
+        if index == len(self.frames) - 1:
+            video.close()
+        if image is None:
             raise FlightError(
-                f"{path}: no frame at {frame.t_s - self._video_start_s:.3f} s ({frame.file}): check t_s in frames.csv, "
+                f"{video.path}: no frame at {at_s:.3f} s ({frame.file}): check t_s in frames.csv, "
                 "or give the time at which the video begins as start_s in [frames]"
             )
-        _check_size(path, (image.shape[1], image.shape[0]), self.camera)
-        return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
+        _check_size(video.path, (image.shape[1], image.shape[0]), self.camera)
+        return image
 
 
 def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
@@ -253,8 +246,7 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
 
     video = None
     if toml.has("frames", "video"):
-        video = folder / toml.text("frames", "video")
-        _open_video(video).release()
+        video = Video(folder / toml.text("frames", "video"))
         has_images = True
     else:
         has_images = _check_files(
@@ -310,18 +302,13 @@ class _Toml:
     """flight.toml with typed, located access to its keys."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         if not path.parent.is_dir():
             raise FlightError(
                 f"{path.parent}: no such folder: a flight is a folder with flight.toml and frames.csv"
             )
-        self.lines = read_text(path).splitlines()
-        try:
-            self.data = tomllib.loads("\n".join(self.lines))
-        except tomllib.TOMLDecodeError as error:
-            at = re.search(r"\(at line (\d+), column (\d+)\)", str(error))
-            line, column = (int(at[1]), int(at[2])) if at else (len(self.lines), None)
-            raise refuse(path, line, column, f"not TOML: {str(error).split(' (at')[0]}") from None
+        self.path = path
+        self._toml = read_toml(path, error=FlightError, missing=FlightError)
+        self.data, self.lines = self._toml.data, self._toml.lines
         for key, value in self.data.items():
             if key in _TOP:
                 self._typed("", key, value, _TOP[key])
@@ -353,23 +340,9 @@ class _Toml:
             }
             raise self.refuse(section, key, f"{key!r} is {value!r}: it must be {words[kind]}")
 
-    def where(self, section: str, key: str) -> tuple[int, int]:
-        """Line and column of a key, or of its section where it is missing."""
-        current, section_at = "", (1, 1)
-        for i, line in enumerate(self.lines, start=1):
-            header = re.match(r"\s*\[+\s*([^\]\s]+)\s*\]+", line)
-            if header:
-                current = header[1]
-                if current in (section, key):
-                    section_at = (i, line.index("[") + 1)
-                continue
-            found = re.match(rf"(\s*)[\"']?{re.escape(key)}[\"']?\s*[=.]", line)
-            if found and current == section:
-                return i, len(found[1]) + 1
-        return section_at
-
     def refuse(self, section: str, key: str, message: str) -> FlightError:
-        return refuse(self.path, *self.where(section, key), message)
+        """The error at a key, or at its section where it is missing."""
+        return refuse(self.path, *self._toml.where(*([section] if section else []), key), message)
 
     def section(self, section: str) -> dict[str, Any]:
         found: dict[str, Any] = self.data.get(section, {}) if section else self.data
@@ -566,28 +539,12 @@ def _check_size(path: Path, size: tuple[int, int], camera: Camera) -> None:
         )
 
 
-def _decoded(path: Path, flags: int) -> NDArray[Any] | None:
-    # None for what is no whole picture.
+def _decoded(path: Path, flags: int) -> NDArray[Any]:
+    # The sensor's own rows and columns: an EXIF turn would swap them under the calibration.
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FlightError(f"{path}: the picture cannot be read ({error.strerror})") from None
-    return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if _is_whole(data) else None
-
-
-def _is_whole(data: bytes) -> bool:
-    # OpenCV fills up what is missing of a picture with grey and says nothing; Pillow refuses it, but decodes it again.
-    if data.endswith((b"\xff\xd9", b"IEND\xaeB`\x82")):
-        return True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large pictures and odd tags, which do not matter here
-            with Image.open(io.BytesIO(data)) as image:
-                image.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
-        return not (data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error))
-    return True
+        return decode(read_bytes(path), str(path), flags=flags)
+    except InputError as error:
+        raise FlightError(f"{error}, or remove its row from frames.csv") from None
 
 
 def _check_files(folder: Path, names: Sequence[str], table: Table, camera: Camera, *, optional: bool) -> bool:
@@ -613,17 +570,6 @@ def _check_files(folder: Path, names: Sequence[str], table: Table, camera: Camer
                 f"{folder / name}: no readable image: copy it again or remove its row from frames.csv"
             ) from None
     return True
-
-
-def _open_video(path: Path) -> Any:
-    if not path.is_file():
-        raise FlightError(f"{path}: the video is missing: [frames] video in flight.toml names it")
-    capture = cv2.VideoCapture(str(path))
-    if not capture.isOpened() or capture.get(cv2.CAP_PROP_FPS) <= 0:
-        raise FlightError(
-            f"{path}: no readable video: convert it (for example to H.264 in .mp4) or give frames/"
-        )
-    return capture
 
 
 # ---------------------------------------------------------------- odometry and reference

@@ -7,7 +7,7 @@ from pathlib import Path
 from brmgeo.errors import FlightError, MissingInputError
 from brmgeo.flight.poses import TEXT_READERS, OdometryOptions, PoseReader
 from brmgeo.flight.readings import Odometry
-from brmgeo.flight.tables import nearest
+from brmgeo.settings import nearest
 
 __all__ = ["READERS", "OdometryOptions", "read_odometry"]
 

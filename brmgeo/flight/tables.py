@@ -6,13 +6,13 @@ import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 
 from brmgeo.errors import FlightError
 from brmgeo.flight.readings import FloatArray
+from brmgeo.settings import nearest
 
 
 def refuse(
@@ -23,12 +23,6 @@ def refuse(
     if column is not None:
         where += f": column {column}"
     return FlightError(f"{where}: {message}", needs=needs)
-
-
-def nearest(word: str, known: Sequence[str]) -> str:
-    """A hint for a message: the known word nearest to ``word``, or all of them."""
-    close = get_close_matches(word, known, 1)
-    return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
 
 
 @dataclass(frozen=True, slots=True)

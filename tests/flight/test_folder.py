@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from brmgeo.errors import FlightError
 from brmgeo.flight.camera import pixel_from_point, world_from_camera
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.motion import motions
+from brmgeo.flight.video import Video
 from brmgeo.flight.view import make_view
 from brmgeo.geo.crs import transformer
 
@@ -178,7 +180,7 @@ def test_a_single_frame_is_a_flight(folder: Path) -> None:
     assert len(motions(flight.odometry, flight.times_s)) == len(flight.frames) == 1
 
 
-def test_a_video_stands_in_for_the_frames(folder: Path) -> None:
+def test_a_video_stands_in_for_the_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = cv2.VideoWriter(str(folder / "flight.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 2.0, (32, 24))
     if not writer.isOpened():
         pytest.skip("this OpenCV writes no MJPG")
@@ -191,6 +193,28 @@ def test_a_video_stands_in_for_the_frames(folder: Path) -> None:
     flight = read_flight(folder)
     for i in (0, 2, 1, 3):  # back and forth
         assert flight.image(i).mean() == pytest.approx(80 * i, abs=4)
+    video = Video(folder / "flight.avi")
+    assert not video.is_open
+    opened: list[str] = []
+    real = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or real(name))
+    for i in range(31):
+        assert video.image(i) is not None
+    assert len(opened) == 1, "in order, each picture is decoded once"
+    assert video.image(31) is None
+    assert not pickle.loads(pickle.dumps(video)).is_open
+    video.close()
+    assert not video.is_open
+    assert video.image(3) is not None
+    del opened[:]
+    with read_flight(folder) as flight:
+        flight.image(1)
+        flight.image(2)
+        assert len(opened) == 2, "once to look at it, once to read"
+    assert flight.image(3).mean() == pytest.approx(240, abs=4)
+    assert len(opened) == 3, "it was closed with the flight"
+    flight.image(3)
+    assert len(opened) == 4, "and with the last frame"
     edit(folder / "frames.csv", "15,f3.jpg", "99,f3.jpg")
     with pytest.raises(FlightError, match=r"no frame at 99.000 s \(f3.jpg\)"):
         read_flight(folder).image(3)
@@ -204,11 +228,11 @@ LENS = "fx = 20.0\nfy = 20.0\ncx = 15.5\ncy = 11.5\ndistortion = "
 Fault = Callable[[Path], None]
 FAULTS: list[tuple[str, Fault, str]] = [
     ("no folder", lambda f: f.rename(f.with_name("gone")), "no such folder"),
-    ("no toml", lambda f: (f / "flight.toml").unlink(), "flight.toml: the file is missing"),
+    ("no toml", lambda f: (f / "flight.toml").unlink(), "flight.toml: there is no such file"),
     (
         "bad toml",
         lambda f: edit(f / "flight.toml", "width = 32", "width 32"),
-        r"flight.toml:3: column \d+: not TOML",
+        r"flight.toml:3: column \d+: not valid TOML",
     ),
     (
         "unknown key",
