@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ def make_odometry(flight_dir: Path, method: Method = "auto") -> dict[str, Any]:
         "tracks": made.tracks,
         "blind": made.blind,
     }
-    section = write_track(flight_dir, rounded_track(made.odometry), stem=stem, columns=columns)
+    track = replace(made.odometry, wxyz=np.round(made.odometry.wxyz, 9))
+    section = write_track(flight_dir, rounded_track(track), stem=stem, columns=columns)
     name_track(flight_dir, section, MADE_BY)
     return facts
 

@@ -17,13 +17,12 @@ from brmgeo.geo.raster import box_of
 from brmgeo.locate.maps import Maps, read_maps
 from brmgeo.region import FlightSettings as RegionFlight
 from brmgeo.region import Region
-from brmgeo.synth.flight import FlightSettings, OdometryErrors, simulate
+from brmgeo.synth.flight import FlightSettings, OdometryErrors, read_simulation_settings, simulate
 from brmgeo.synth.mission import FineImagery, flight_path, imagery_along, read_ground, simulator_settings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
 from pipelines.maps import native_imagery
 from pipelines.regions import town_style
-from pipelines.simulation import read_simulation_settings
 
 Mode = Literal["masks", "frames", "both"]
 SIMULATED = frozenset(

@@ -19,6 +19,7 @@ from brmgeo.synth.flight.ground import Ground, Imagery
 from brmgeo.synth.flight.paths import lawnmower, path_from_geojson, place, random_mission, rectangle
 from brmgeo.synth.flight.sensors import imu_of, odometry_of
 from brmgeo.synth.flight.settings import FlightSettings, MaskErrors, OdometryErrors
+from brmgeo.synth.flight.settings_file import read_simulation_settings
 from brmgeo.synth.flight.views import SimulatedViews, simulate_views
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "path_from_geojson",
     "place",
     "random_mission",
+    "read_simulation_settings",
     "rectangle",
     "simulate",
     "simulate_views",

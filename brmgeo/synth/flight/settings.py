@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+from pydantic import Field
 
 from brmgeo.flight.readings import Attitude, Camera
+
+# Least and most of the numbers, held where a file of settings is read.
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Length = Annotated[float, Field(ge=0.1, le=1000.0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +31,13 @@ class MaskErrors:
             of all pixels is as it was; 0.916 is the accuracy of the paper's network.
     """
 
-    missed: float = 0.12
-    missed_always: float = 0.5
-    false_blobs: float = 3.0
-    blob_radius_m: float = 4.0
-    edge_sigma_m: float = 0.5
-    edge_scale_m: float = 3.0
-    pixel_accuracy: float | None = None
+    missed: Share = 0.12
+    missed_always: Share = 0.5
+    false_blobs: NotNegative = 3.0
+    blob_radius_m: Length = 4.0
+    edge_sigma_m: NotNegative = 0.5
+    edge_scale_m: Length = 3.0
+    pixel_accuracy: Annotated[float, Field(ge=0.5, le=1.0)] | None = None
 
     @classmethod
     def none(cls) -> MaskErrors:
@@ -55,12 +63,12 @@ class OdometryErrors:
         rate_hz: poses a second.
     """
 
-    scale_sigma: float = 0.05
-    scale_bias: float | None = None
-    drift_deg_sqrt_min: float = 0.75
-    noise_m_sqrt_s: float = 0.05
-    reset_times_s: tuple[float, ...] = ()
-    rate_hz: float = 10.0
+    scale_sigma: NotNegative = 0.05
+    scale_bias: Annotated[float, Field(ge=-0.9, le=10.0)] | None = None
+    drift_deg_sqrt_min: NotNegative = 0.75
+    noise_m_sqrt_s: NotNegative = 0.05
+    reset_times_s: tuple[NotNegative, ...] = ()
+    rate_hz: Annotated[float, Field(ge=0.5, le=100.0)] = 10.0
 
     @classmethod
     def none(cls) -> OdometryErrors:
@@ -94,25 +102,25 @@ class FlightSettings:
 
     camera: Camera = field(default_factory=lambda: Camera.from_fov(640, 480, 43.0))
     mount: Attitude = field(default_factory=Attitude)
-    speed_m_s: float = 5.0
-    frame_interval_s: float = 5.0
-    agl_m: float = 150.0
-    agl_sigma_m: float = 2.0
-    wobble_deg: float = 1.5
-    cruise_pitch_deg: float = 2.0
-    crab_sigma_deg: float = 3.0
-    turn_radius_m: float = 8.0
-    attitude_error_deg: float = 0.2
-    agl_error_m: float = 0.4
-    compass_error_deg: float | None = None
+    speed_m_s: Annotated[float, Field(ge=0.1, le=200.0)] = 5.0
+    frame_interval_s: Annotated[float, Field(ge=0.02, le=60.0)] = 5.0
+    agl_m: Annotated[float, Field(ge=5.0, le=5000.0)] = 150.0
+    agl_sigma_m: NotNegative = 2.0
+    wobble_deg: NotNegative = 1.5
+    cruise_pitch_deg: Annotated[float, Field(ge=-45.0, le=45.0)] = 2.0
+    crab_sigma_deg: NotNegative = 3.0
+    turn_radius_m: Length = 8.0
+    attitude_error_deg: NotNegative = 0.2
+    agl_error_m: NotNegative = 0.4
+    compass_error_deg: NotNegative | None = None
     masks: MaskErrors = field(default_factory=MaskErrors)
     odometry: OdometryErrors | None = field(default_factory=OdometryErrors)
-    exposure_s: float = 1.0 / 250.0
-    exposure_sigma: float = 0.05
-    noise_levels: float = 3.0
-    vignette: float = 0.15
-    jpeg_quality: int = 92
-    sun_azimuth_deg: float = 152.0
+    exposure_s: NotNegative = 1.0 / 250.0
+    exposure_sigma: NotNegative = 0.05
+    noise_levels: NotNegative = 3.0
+    vignette: Share = 0.15
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92
+    sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 152.0
 
     def exact(self) -> FlightSettings:
         """The same flight with perfect instruments and masks."""
