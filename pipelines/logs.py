@@ -76,7 +76,8 @@ def inspect_document(paths: Sequence[Path], options: LogOptions | None = None) -
         "Made by `brmgeo inspect PATH ... --write FILE`, which tells this of any log, bag, text of poses, folder of photos",
         "or flight folder. `brmgeo import PATH --out flight/` makes a flight folder of a log",
         "(`pip install 'brmgeo[logs]'` for ROS bags, PX4 and ArduPilot logs). FAULT is what import refuses, with the",
-        "option that mends it. A log without pictures takes them from `--photos` (by its camera triggers) or `--video`.",
+        "parameter that mends it: an option of that name (`--body` for `body_deg`). A log without",
+        "pictures takes them from `--photos` (by its camera triggers) or `--video`.",
         "",
     ]
     others = []
