@@ -20,20 +20,24 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import geopandas as gpd
 import numpy as np
-import pandas as pd
-import pyogrio
 import shapely
 from numpy.typing import NDArray
 
 from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KOREAN_KINDS
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
+from brmgeo.extras import extra
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
 from brmgeo.ingest.dxf import MAX_DROPPED_SHARE, SNAP_M, read_dxf
+from brmgeo.ingest.groups import grouped
 from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings, shape_keys
+
+with extra("maps", "reading footprints"):
+    import geopandas as gpd
+    import pandas as pd
+    import pyogrio
 
 COLUMNS = ("geometry", "layer", "kind", "floors", "handle", "source", "sheet")
 SHEET_COLUMNS = ("geometry", "sheet", "source", "outline", "footprints", "area_m2", "dropped_share")
@@ -104,7 +108,16 @@ def read_footprints(
     if path.suffix.lower() in {".dxf", ".dwg"}:
         return _from_dxf(path, crs or source_crs, source_crs, layers, sheet, snap_m, max_dropped_share)
     return _from_vector(
-        path, crs, source_crs, layer, encoding, sheet, kind_column, floors_column, snap_m, max_dropped_share
+        path,
+        crs,
+        source_crs,
+        layer=layer,
+        encoding=encoding,
+        sheet=sheet,
+        kind_column=kind_column,
+        floors_column=floors_column,
+        snap_m=snap_m,
+        max_dropped_share=max_dropped_share,
     )
 
 
@@ -176,23 +189,14 @@ def merge_at_edges(
     source, kind = frame["source"].to_numpy(dtype=object), frame["kind"].to_numpy(dtype=object)
     pair = (source[a] != source[b]) & (kind[a] == kind[b])
     a, b = a[pair], b[pair]
-    parent = np.arange(len(frame))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = int(parent[i])
-        return i
-
-    for i, j in zip(a.tolist(), b.tolist()):
+    along = np.zeros(len(a), dtype=np.bool_)
+    for k, (i, j) in enumerate(zip(a.tolist(), b.tolist())):
         cut_i = shapely.intersection(polygons[i].boundary, strip).length
         cut_j = shapely.intersection(polygons[j].boundary, strip).length
         reach = polygons[j].buffer(tolerance_m, cap_style="flat")
         contact = shapely.intersection(shapely.intersection(polygons[i].boundary, strip), reach).length
-        if contact >= min(0.5, 0.5 * min(cut_i, cut_j)) and contact > 4.0 * tolerance_m:
-            low, high = sorted((root(i), root(j)))
-            parent[high] = low
-    roots = np.array([root(i) for i in range(len(frame))])
+        along[k] = contact >= min(0.5, 0.5 * min(cut_i, cut_j)) and contact > 4.0 * tolerance_m
+    roots = grouped(len(frame), a[along], b[along])
     out = polygons.copy()
     keep = np.ones(len(frame), dtype=np.bool_)
     for head in np.flatnonzero(np.bincount(roots, minlength=len(frame)) > 1).tolist():
@@ -259,7 +263,7 @@ def _from_dxf(
     max_dropped_share: float,
 ) -> Footprints:
     if crs is None:
-        raise CrsError(f"{path.name}: a DXF does not say its CRS: give it, such as --crs EPSG:5187")
+        raise CrsError(f"{path.name}: a DXF does not say its CRS: give it, such as EPSG:5187", needs="crs")
     require_projected_metres(crs)
     native = source_crs or crs
     require_projected_metres(native)
@@ -290,7 +294,16 @@ def _from_dxf(
     polygons = _moved(polygons, native, crs)
     repairs = _repairs_moved(read.repairs, native, crs)
     return _assembled(
-        path.name, number, crs, polygons, rows, None, neatline, repairs, read.counts, read.dropped_share
+        path.name,
+        number,
+        crs,
+        polygons,
+        rows,
+        floors=None,
+        neatline=neatline,
+        repairs=repairs,
+        counts=read.counts,
+        dropped_share=read.dropped_share,
     )
 
 
@@ -298,6 +311,7 @@ def _from_vector(
     path: Path,
     crs: str | None,
     source_crs: str | None,
+    *,
     layer: str | None,
     encoding: str | None,
     sheet: str | None,
@@ -311,8 +325,9 @@ def _from_vector(
     if native is None:
         beside = f" (no {path.stem}.prj beside it)" if path.suffix.lower() == ".shp" else ""
         raise CrsError(
-            f"{path.name}: the file does not say its CRS{beside}: give it, such as --source-crs EPSG:5187 (in a region "
-            'file: crs = "EPSG:5187" under [footprints])'
+            f"{path.name}: the file does not say its CRS{beside}: give it, such as EPSG:5187 (in a region file: "
+            'crs = "EPSG:5187" under [footprints])',
+            needs="source_crs",
         )
     target = crs or crs_name(native)
     require_projected_metres(target)
@@ -359,7 +374,16 @@ def _from_vector(
     counts = {"outlines": outlines, "footprints": len(from_row), "other_entities": other}
     counts |= {f"repair_{kind}": n for kind, n in repair_counts(repairs).items()}
     return _assembled(
-        path.name, number, target, repaired.polygons, columns, floors, None, repairs, counts, share
+        path.name,
+        number,
+        target,
+        repaired.polygons,
+        columns,
+        floors=floors,
+        neatline=None,
+        repairs=repairs,
+        counts=counts,
+        dropped_share=share,
     )
 
 
@@ -572,6 +596,7 @@ def _assembled(
     crs: str,
     polygons: NDArray[np.object_],
     columns: dict[str, NDArray[np.object_]],
+    *,
     floors: Any,
     neatline: shapely.Geometry | None,
     repairs: list[Repair],

@@ -395,6 +395,13 @@ class Painter:
         )
 
     def _ground(self, shape: tuple[int, int], rows: NDArray[np.int64], cols: NDArray[np.int64]) -> F32:
+        base, label, lines = self._country(shape)
+        self._yards(base, label, lines)
+        self._streets(base, label, lines)
+        return self._textured(base, label, lines, rows, cols)
+
+    def _country(self, shape: tuple[int, int]) -> tuple[U8, U8, F32]:
+        """Meadows, fields, sand, woods and water: their colours, what each pixel is, and factors on its light."""
         town, gsd, frame = self._town, self._gsd, self._frame
         base = np.empty((*shape, 3), np.uint8)
         base[:] = _MEADOW_COLOUR[self._style.season]
@@ -406,17 +413,8 @@ class Painter:
             )
         for i in self._fields.near(*frame):
             f = town.fields[i]
-            self._area(
-                base,
-                label,
-                lines,
-                self._fields.rings[i],
-                self._fields.boxes[i],
-                f.kind,
-                f.angle_rad,
-                f.shade,
-                i,
-            )
+            rings, box = self._fields.rings[i], self._fields.boxes[i]
+            self._area(base, label, lines, rings, box, kind=f.kind, angle=f.angle_rad, shade=f.shade, index=i)
         for i in self._sand.near(*frame):
             ragged = self._low(self._broad[2], shape)
             sand = np.zeros(shape, np.uint8)
@@ -434,23 +432,23 @@ class Painter:
             depth = cv2.GaussianBlur(water, (0, 0), 4.5 / gsd).astype(np.float32) / 255.0
             inside = (water > 127).astype(np.float32)
             lines *= 1.0 + inside * (0.32 - 0.42 * depth + 0.05 * self._low(self._broad[2], shape))
-        for i in self._grounds.near(*frame):
-            g = town.grounds[i]
-            self._area(
-                base,
-                label,
-                lines,
-                self._grounds.rings[i],
-                self._grounds.boxes[i],
-                g.kind,
-                g.angle_rad + self._turn,
-                g.shade,
-                i,
-            )
+        return base, label, lines
+
+    def _yards(self, base: U8, label: U8, lines: F32) -> None:
+        """Grounds about buildings, parking places and sports fields."""
+        for i in self._grounds.near(*self._frame):
+            g = self._town.grounds[i]
+            angle = g.angle_rad + self._turn
+            rings, box = self._grounds.rings[i], self._grounds.boxes[i]
+            self._area(base, label, lines, rings, box, kind=g.kind, angle=angle, shade=g.shade, index=i)
             if g.kind == "parking":
-                self._stalls(base, self._grounds.rings[i], g.angle_rad + self._turn)
+                self._stalls(base, rings, angle)
             elif g.kind == "sports":
-                self._track(base, self._grounds.rings[i])
+                self._track(base, rings)
+
+    def _streets(self, base: U8, label: U8, lines: F32) -> None:
+        """Kerbs and surfaces of roads, lesser ones first, and the paint on them."""
+        frame = self._frame
         near = self._roads.near(*frame)
         for kind in ("track", "lane", "street", "main", "arterial"):
             colour = _ROAD_COLOUR[kind]
@@ -465,7 +463,7 @@ class Painter:
                 self._fill(base, self._roads.rings[i], colour)
                 self._fill(label, self._roads.rings[i], _PAVED if kind != "track" else _GRAVEL, False)
                 self._fill_ones(lines, self._roads.rings[i])
-        strength = min(1.0, 0.2 / gsd)
+        strength = min(1.0, 0.2 / self._gsd)
         b = self._mark_boxes
         hit = (b[:, 0] <= frame[2]) & (b[:, 2] >= frame[0]) & (b[:, 1] <= frame[3]) & (b[:, 3] >= frame[1])
         for k in np.flatnonzero(hit).tolist():
@@ -473,6 +471,11 @@ class Painter:
             mixed = tuple(int(strength * p + (1 - strength) * 106) for p in paint)
             cv2.polylines(base, [self._points(points)], False, mixed, 1, cv2.LINE_AA, _SHIFT)
 
+    def _textured(
+        self, base: U8, label: U8, lines: F32, rows: NDArray[np.int64], cols: NDArray[np.int64]
+    ) -> F32:
+        """The painted ground with the grain of each surface, worn patches and the crowns of woods."""
+        gsd, shape = self._gsd, label.shape
         part = self._texture
         texture = np.take(_GRAIN[:, 0], label) * part(
             _noise(self._seed, round(0.3 / gsd, 2) if gsd < 0.6 else 0.5)
@@ -511,8 +514,8 @@ class Painter:
         return (r0, r1, c0, c1) if r1 > r0 and c1 > c0 else None
 
     def _area(
-        self, base: U8, label: U8, lines: F32, rings: list[NDArray[np.float64]], box: NDArray[np.float64], kind: str,
-        angle: float, shade: float, index: int,
+        self, base: U8, label: U8, lines: F32, rings: list[NDArray[np.float64]], box: NDArray[np.float64], *,
+        kind: str, angle: float, shade: float, index: int,
     ) -> None:  # fmt: skip
         """One parcel or yard: its colour, its texture class and its rows."""
         colour, spread, texture, spacing, strength = _GROUND[kind]
@@ -813,7 +816,9 @@ class Painter:
             )
             light = light * (1.0 - 0.06 * ((u % 1.8) < 0.25)) if gsd < 0.5 else light
         else:
-            light, tone = self._flat(b, light, tone, fine, stain, mask, u, v, long, wide, rng)
+            light, tone = self._flat(
+                b, light, tone, fine, stain, mask, u=u, v=v, long=long, wide=wide, rng=rng
+            )
         return np.asarray(colour * tone * light[..., None], dtype=np.float32)
 
     def _hip(self, ring: NDArray[np.float64], px: F32, py: F32) -> F32:
@@ -843,8 +848,8 @@ class Painter:
         )
 
     def _flat(
-        self, b: Building, light: F32, tone: F32, fine: F32, stain: F32, mask: U8, u: F32, v: F32, long: float, wide: float,
-        rng: np.random.Generator,
+        self, b: Building, light: F32, tone: F32, fine: F32, stain: F32, mask: U8, *, u: F32, v: F32, long: float,
+        wide: float, rng: np.random.Generator,
     ) -> tuple[F32, F32]:  # fmt: skip
         """A flat concrete roof: parapet, its shadow, stains, stair heads, tanks and machines with shadows of their own."""
         gsd = self._gsd

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,65 +128,15 @@ def _write_sheet(
             f"sheet {number} holds no building of the generated town: choose sheets that meet {town.bounds}"
         )
     rng = np.random.default_rng([town.seed, 0xD7, index])
-    talk = logging.getLogger("ezdxf")
-    level = talk.level
-    talk.setLevel(logging.ERROR)  # it warns that R12 has no drawing units, whatever units it is given
-    try:
-        doc = new(version, setup=False, units=0 if version == "R12" else 6)
-    finally:
-        talk.setLevel(level)
-    if version == "R12":
-        doc.encoding = "cp949"
-        doc.header["$DWGCODEPAGE"] = "ANSI_949"
+    doc = _new_drawing(version)
     drawer = _Drawer(doc, lightweight=version != "R12")
-
-    outlines: list[_Outline] = []
-    truths: list[BaseGeometry] = []
-    simple: list[int] = []
-    for polygon, building, cut in clipped:
-        rings = [polygon.exterior, *polygon.interiors]
-        if not cut and len(rings) == 1 and 20 < polygon.area < 300:
-            simple.append(len(outlines))
-        truths.append(polygon)
-        outlines += [_Outline(np.asarray(r.coords)[:-1, :2].copy(), building.layer) for r in rings]
-    order = rng.permutation(simple).tolist()
-    counts = {kind: 0 for kind, _ in faults}
-    bends: dict[int, float] = {}
-    standing = shapely.STRtree(truths)
-    for kind, wanted in faults:
-        while kind != "zero_area" and counts[kind] < wanted and order:
-            k = order.pop()
-            changed = _spoil(outlines[k], kind, truths, standing, bends, k)
-            counts[kind] += int(changed)
-
-    handles: dict[str, list[str]] = {}
-
-    def note(kind: str, entity: Any) -> None:
-        handles.setdefault(kind, []).append(str(entity.dxf.handle))
-
-    for k, o in enumerate(outlines):
-        if o.fault == "line_chain":
-            for a, b in zip(o.points, np.roll(o.points, -1, axis=0)):
-                note("line_chain", drawer.line(a, b, o.layer))
-            continue
-        points, closed = o.points, True
-        if o.fault == "open_repeated_vertex":
-            points, closed = np.vstack([points, points[:1]]), False
-        elif o.fault == "gap_5cm":
-            back = points[-1] - points[0]
-            points = np.vstack([points, points[0] + back * (GAP_M / math.hypot(*back))])
-            closed = False
-        elevation = round(float(rng.uniform(40, 120)), 2) if o.fault == "z_values" else 0.0
-        entity = drawer.ring(points, o.layer, closed, elevation, bends.get(k))
-        if o.fault and o.fault != "duplicate":
-            note(o.fault, entity)
-        if o.fault == "duplicate":
-            again = drawer.ring(np.roll(o.points, 1, axis=0), o.layer, True)
-            note("duplicate", again)
+    truths: list[BaseGeometry] = [polygon for polygon, _, _ in clipped]
+    outlines, counts, bends = _outlines(clipped, truths, faults, rng)
+    handles = _draw_outlines(drawer, outlines, bends, rng)
     for _ in range(dict(faults).get("zero_area", 0)):
         p = outlines[int(rng.integers(len(outlines)))].points[0] + rng.uniform(1, 4, 2)
         flat = np.array([p, p + [1.5, 0.0], p + [3.0, 0.0]])
-        note("zero_area", drawer.ring(flat, BUILDING_LAYERS[1], True))
+        _note(handles, "zero_area", drawer.ring(flat, BUILDING_LAYERS[1], True))
         counts["zero_area"] = counts.get("zero_area", 0) + 1
 
     groups = [p for g in town.groups for p in polygons_of(g.intersection(sheet), 50.0)]
@@ -216,6 +166,80 @@ def _write_sheet(
         "faults": counts,
         "handles": handles,
     }
+
+
+def _new_drawing(version: str) -> Drawing:
+    talk = logging.getLogger("ezdxf")
+    level = talk.level
+    talk.setLevel(logging.ERROR)  # it warns that R12 has no drawing units, whatever units it is given
+    try:
+        doc = new(version, setup=False, units=0 if version == "R12" else 6)
+    finally:
+        talk.setLevel(level)
+    if version == "R12":
+        doc.encoding = "cp949"
+        doc.header["$DWGCODEPAGE"] = "ANSI_949"
+    return doc
+
+
+def _outlines(
+    clipped: Sequence[tuple[Polygon, Building, bool]],
+    truths: list[BaseGeometry],
+    faults: Sequence[tuple[str, int]],
+    rng: np.random.Generator,
+) -> tuple[list[_Outline], dict[str, int], dict[int, float]]:
+    """Rings to draw, some spoiled by faults; how many faults of each kind; bulges by the number of their outline.
+
+    ``truths``, the buildings as they will be read, change with the faults that change what ground is built on.
+    """
+    outlines: list[_Outline] = []
+    simple: list[int] = []
+    for polygon, building, cut in clipped:
+        rings = [polygon.exterior, *polygon.interiors]
+        if not cut and len(rings) == 1 and 20 < polygon.area < 300:
+            simple.append(len(outlines))
+        outlines += [_Outline(np.asarray(r.coords)[:-1, :2].copy(), building.layer) for r in rings]
+    order = rng.permutation(simple).tolist()
+    counts = {kind: 0 for kind, _ in faults}
+    bends: dict[int, float] = {}
+    standing = shapely.STRtree(truths)
+    for kind, wanted in faults:
+        while kind != "zero_area" and counts[kind] < wanted and order:
+            k = order.pop()
+            changed = _spoil(outlines[k], kind, truths, standing, bends, k)
+            counts[kind] += int(changed)
+    return outlines, counts, bends
+
+
+def _note(handles: dict[str, list[str]], kind: str, entity: Any) -> None:
+    handles.setdefault(kind, []).append(str(entity.dxf.handle))
+
+
+def _draw_outlines(
+    drawer: _Drawer, outlines: Sequence[_Outline], bends: Mapping[int, float], rng: np.random.Generator
+) -> dict[str, list[str]]:
+    """Draws every outline as its fault wants it; handles of the faulty entities by kind."""
+    handles: dict[str, list[str]] = {}
+    for k, o in enumerate(outlines):
+        if o.fault == "line_chain":
+            for a, b in zip(o.points, np.roll(o.points, -1, axis=0)):
+                _note(handles, "line_chain", drawer.line(a, b, o.layer))
+            continue
+        points, closed = o.points, True
+        if o.fault == "open_repeated_vertex":
+            points, closed = np.vstack([points, points[:1]]), False
+        elif o.fault == "gap_5cm":
+            back = points[-1] - points[0]
+            points = np.vstack([points, points[0] + back * (GAP_M / math.hypot(*back))])
+            closed = False
+        elevation = round(float(rng.uniform(40, 120)), 2) if o.fault == "z_values" else 0.0
+        entity = drawer.ring(points, o.layer, closed, elevation, bends.get(k))
+        if o.fault and o.fault != "duplicate":
+            _note(handles, o.fault, entity)
+        if o.fault == "duplicate":
+            again = drawer.ring(np.roll(o.points, 1, axis=0), o.layer, True)
+            _note(handles, "duplicate", again)
+    return handles
 
 
 def _spoil(

@@ -146,37 +146,9 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
     cross = LineString(centre.world(np.column_stack([cross_u, v])))
 
     domain = shapely.box(*domain_bounds)
-    hills = Waves(rng, (max(380.0 * scale, 120.0), max(1500.0 * scale, 400.0)), 28)
-    step = 12.0
-    gx = np.arange(left - step, right + 2 * step, step)
-    gy = np.arange(bottom - step, top + 2 * step, step)
-    grid = np.stack(np.meshgrid(gx, gy), axis=-1)
-    hill = _hillness(grid.reshape(-1, 2), hills, river, centre, radius).reshape(grid.shape[:2])
-    rough = Waves(rng, (35.0, 130.0), 40)(grid.reshape(-1, 2)).reshape(hill.shape)
-    level = float(np.quantile(hill, 1.0 - style.forest_share))
+    relief = _relief(domain_bounds, rng, scale, river, centre, radius)
+    level = float(np.quantile(relief.hill, 1.0 - style.forest_share))
     keep_out = shapely.union_all([bank.buffer(12.0), arterial.buffer(20.0), cross.buffer(10.0)])
-    woods: list[Polygon] = []
-    traced = contourpy.contour_generator(
-        gx, gy, hill + 0.13 * rough, fill_type=contourpy.FillType.OuterOffset
-    )
-    filled: Any = traced.filled(level, float(hill.max()) + 10.0)
-    points, offsets = filled
-    for ring, cuts in zip(points, offsets):
-        parts = [ring[a:b] for a, b in itertools.pairwise(cuts)]
-        shape = shapely.make_valid(Polygon(parts[0], [p for p in parts[1:] if Polygon(p).area > 400.0]))
-        woods += polygons_of(shape.intersection(domain).difference(keep_out), 500.0)
-
-    elevation = 62.0 + 14.0 * np.maximum(hill + 0.8, 0) + 60.0 * np.maximum(hill - level + 0.25, 0) ** 1.3
-    lines: list[tuple[LineString, float]] = []
-    tracer = contourpy.contour_generator(
-        gx, gy, elevation + 0.6 * rough, line_type=contourpy.LineType.Separate
-    )
-    for z in np.arange(45.0, float(elevation.max()), 5.0):
-        rings: Any = tracer.lines(z)
-        for line in rings:
-            if len(line) > 3:
-                clipped = shapely.intersection(LineString(line), domain)
-                lines += [(p, float(z)) for p in shapely.get_parts(clipped) if p.geom_type == "LineString"]
     return Ground(
         domain=domain,
         water=polygons_of(water.intersection(domain)),
@@ -187,11 +159,68 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
         levees=levees,
         centre=centre,
         town_radius_m=radius,
-        hills=hills,
+        hills=relief.hills,
         forest_level=level,
-        woods=woods,
-        contours=lines,
+        woods=_woods(relief, level, domain, keep_out),
+        contours=_contours(relief, level, domain),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Relief:
+    """How hilly the ground is, on a grid: ``x`` (w,), ``y`` (h,) metres, ``hill`` and its ``rough`` (h, w)."""
+
+    hills: Waves
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    hill: NDArray[np.float64]
+    rough: NDArray[np.float64]
+
+
+def _relief(
+    bounds: Bounds, rng: np.random.Generator, scale: float, river: LineString, centre: Frame, radius: float
+) -> _Relief:
+    left, bottom, right, top = bounds
+    hills = Waves(rng, (max(380.0 * scale, 120.0), max(1500.0 * scale, 400.0)), 28)
+    step = 12.0
+    x = np.arange(left - step, right + 2 * step, step)
+    y = np.arange(bottom - step, top + 2 * step, step)
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    hill = _hillness(grid.reshape(-1, 2), hills, river, centre, radius).reshape(grid.shape[:2])
+    rough = Waves(rng, (35.0, 130.0), 40)(grid.reshape(-1, 2)).reshape(hill.shape)
+    return _Relief(hills, x, y, hill, rough)
+
+
+def _woods(relief: _Relief, level: float, domain: Polygon, keep_out: BaseGeometry) -> list[Polygon]:
+    """Woods where it is hillier than ``level``, ragged at their edges, clearings over 400 m2 left open."""
+    woods: list[Polygon] = []
+    traced = contourpy.contour_generator(
+        relief.x, relief.y, relief.hill + 0.13 * relief.rough, fill_type=contourpy.FillType.OuterOffset
+    )
+    filled: Any = traced.filled(level, float(relief.hill.max()) + 10.0)
+    points, offsets = filled
+    for ring, cuts in zip(points, offsets):
+        parts = [ring[a:b] for a, b in itertools.pairwise(cuts)]
+        shape = shapely.make_valid(Polygon(parts[0], [p for p in parts[1:] if Polygon(p).area > 400.0]))
+        woods += polygons_of(shape.intersection(domain).difference(keep_out), 500.0)
+    return woods
+
+
+def _contours(relief: _Relief, level: float, domain: Polygon) -> list[tuple[LineString, float]]:
+    """Contour lines every 5 m, each with its height."""
+    hill = relief.hill
+    elevation = 62.0 + 14.0 * np.maximum(hill + 0.8, 0) + 60.0 * np.maximum(hill - level + 0.25, 0) ** 1.3
+    lines: list[tuple[LineString, float]] = []
+    tracer = contourpy.contour_generator(
+        relief.x, relief.y, elevation + 0.6 * relief.rough, line_type=contourpy.LineType.Separate
+    )
+    for z in np.arange(45.0, float(elevation.max()), 5.0):
+        rings: Any = tracer.lines(z)
+        for line in rings:
+            if len(line) > 3:
+                clipped = shapely.intersection(LineString(line), domain)
+                lines += [(p, float(z)) for p in shapely.get_parts(clipped) if p.geom_type == "LineString"]
+    return lines
 
 
 def _ribbon(

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from brmgeo.codes import BUILDING_LAYERS
 from brmgeo.errors import InputError, SettingsError
-from brmgeo.ingest.dxf import flatten_bulges, read_dxf
+from brmgeo.ingest.dxf import read_dxf
+from brmgeo.ingest.dxf.entities import flatten_bulges
 
 REAL = (
     Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[2] / "../shared/data")) / "ngii"

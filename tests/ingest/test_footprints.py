@@ -137,8 +137,9 @@ def test_lines_heights_multipolygons_and_points(tmp_path):
 def test_a_shapefile_without_prj_wants_a_crs(tmp_path):
     path = write(town(), tmp_path / "t.shp")
     path.with_suffix(".prj").unlink()
-    with pytest.raises(CrsError, match=r"t\.shp: .*no t\.prj beside it.*--source-crs EPSG:5187"):
+    with pytest.raises(CrsError, match=r"t\.shp: .*no t\.prj beside it.*such as EPSG:5187") as caught:
         read_footprints(path, CRS)
+    assert caught.value.needs == "source_crs"
     assert len(read_footprints(path, CRS, source_crs=CRS).frame) == 40
 
 
