@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-import geopandas as gpd
 import numpy as np
-import pyogrio
 
 from brmgeo.errors import WorkflowError, one_line
 from brmgeo.export.vector import fixed_date
+from brmgeo.extras import extra
 from brmgeo.files import whole_file
+
+with extra("maps", "writing footprints"):
+    import geopandas as gpd
+    import pyogrio
 
 
 class RepairLike(Protocol):

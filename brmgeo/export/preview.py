@@ -9,21 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps, font_manager, rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import FuncNorm, to_rgb
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Polygon, Rectangle
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from scipy import ndimage
 
 from brmgeo.codes import BUILDING, UNKNOWN
 from brmgeo.errors import InputError
+from brmgeo.extras import extra
 from brmgeo.files import whole_file
 from brmgeo.geo.crs import crs_name
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.raster import opened
+
+with extra("maps", "a picture of the maps"):
+    from matplotlib import colormaps, font_manager, rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import FuncNorm, to_rgb
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch, Polygon, Rectangle
 
 WIDTH_PX, DPI = 1600, 100
 INK, PAPER, FAINT = "#1d2430", "#ffffff", "#5d6777"

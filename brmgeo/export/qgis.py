@@ -16,7 +16,6 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-import pyogrio
 from numpy.typing import NDArray
 from pyproj import CRS
 from rasterio.enums import MaskFlags
@@ -25,9 +24,13 @@ from brmgeo.errors import CrsError, InputError
 from brmgeo.export import iso_utc, shown_until_ms, utc_ms
 from brmgeo.export import qgis_style as style
 from brmgeo.export.qgis_style import Style, sub
+from brmgeo.extras import extra
 from brmgeo.files import whole_file
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.raster import opened
+
+with extra("maps", "a QGIS project"):
+    import pyogrio
 
 KIND_FIELDS = ("kind", "layer", "종류")
 SHEET_FIELDS = ("sheet", "number", "name")

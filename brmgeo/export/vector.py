@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
-import pyogrio
-import shapely
 from numpy.typing import NDArray
 
 from brmgeo.errors import CrsError
+from brmgeo.extras import extra
 from brmgeo.files import whole_file
 from brmgeo.geo.crs import parse_crs, transformer
+
+with extra("maps", "writing results for GIS"):
+    import pyarrow as pa
+    import pyogrio
+    import shapely
 
 
 def lonlat(xy: NDArray[np.float64], crs: str) -> NDArray[np.float64]:

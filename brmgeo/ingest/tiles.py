@@ -29,15 +29,18 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import quote
 
-import httpx
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from brmgeo import files
 from brmgeo.errors import InputError, MissingInputError, NetworkError, SettingsError, WorkflowError
+from brmgeo.extras import extra
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.tilegrid import Tile, TileGrid, WebMercatorGrid
+
+with extra("maps", "reading tile services"):
+    import httpx
 
 Progress = Callable[[int, int], None]
 

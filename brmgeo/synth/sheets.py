@@ -18,18 +18,21 @@ from typing import Any
 
 import numpy as np
 import shapely
-from ezdxf._options import options
-from ezdxf.document import Drawing
-from ezdxf.filemanagement import new
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from brmgeo.codes import BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, NEATLINE_LAYER
 from brmgeo.errors import SettingsError
+from brmgeo.extras import extra
 from brmgeo.geo.sheets import sheet_polygon
 from brmgeo.synth.scene import Building, Town
 from brmgeo.synth.terrain import MILLIMETRE, polygons_of
+
+with extra("maps", "drawing DXF sheets"):
+    from ezdxf._options import options
+    from ezdxf.document import Drawing
+    from ezdxf.filemanagement import new
 
 NAME_LAYER = "H0049140"
 GAP_M = 0.05

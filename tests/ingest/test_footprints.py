@@ -212,8 +212,9 @@ def test_dxf_sheets_go_through_the_same_door(tmp_path):
     assert read.frame.area.sum() == pytest.approx(town().area.sum(), rel=1e-4)
     assert read.sheets.loc[0, ["sheet", "outline", "footprints"]].tolist() == [NUMBER, "neatline", 40]
     assert read.sheets.geometry[0].equals_exact(sheet_polygon(NUMBER, CRS), 1e-3, normalize=True)
-    with pytest.raises(CrsError, match="a DXF does not say its CRS"):
+    with pytest.raises(CrsError, match="a DXF does not say its CRS") as caught:
         read_footprints(path)
+    assert caught.value.needs == "crs"
     with pytest.raises(CrsError, match=r"neatline.*EPSG:5187 fits"):
         read_footprints(path, "EPSG:5183")
     moved = read_footprints(path, "EPSG:5186", source_crs=CRS)
