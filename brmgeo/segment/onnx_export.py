@@ -20,7 +20,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from brmgeo.errors import InputError, MissingInputError
+from brmgeo.errors import InputError
+from brmgeo.extras import extra
 from brmgeo.segment.weights import ModelCard, load_network
 
 CARD_KEY = "brmgeo_weights"
@@ -36,16 +37,12 @@ def export_onnx(weights: Path, out: Path, tile_px: int | None = None) -> ModelCa
     Args:
         tile_px: height and width of the input, fixed, for Deepness; None for any size the network takes.
 
-    Raises MissingInputError where the packages are not installed, InputError for bad weights or a size that does not fit.
+    Raises MissingExtraError where the packages are not installed, InputError for bad weights or a size that does not fit.
     """
-    try:
+    with extra("train", "writing a network as ONNX"):
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
         import torch
-    except ImportError as error:
-        raise MissingInputError(
-            f"export-onnx needs {error.name}: pip install 'brmgeo[train]' (torch, onnx, onnxscript)"
-        ) from None
 
     network, card = load_network(weights)
     multiple = network.settings.multiple_px

@@ -20,7 +20,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.extras import extra
 from brmgeo.pictures import decode, read_bytes
 from brmgeo.segment.weights import ModelCard
 
@@ -258,8 +260,9 @@ class Segmenter:
             looks: 2: the answer is the mean of what the network says of the picture and of its mirror image at 1.25 times
                 its GSD; 1: of the picture alone, in 0.6 of the time; None: as the card's threshold and scores were made.
 
-        Raises InputError for files that are not what they should be, MissingInputError where one is not there, and
-        SettingsError for another backend or other looks.
+        Raises InputError for files that are not what they should be, MissingInputError where one is not there,
+        MissingExtraError where torch is to run it and is not installed, and SettingsError for another backend or other
+        looks.
         """
         if backend is not None and backend not in get_args(Backend):
             raise SettingsError(f"backend {backend!r}: give one of {', '.join(get_args(Backend))}")
@@ -280,13 +283,9 @@ class Segmenter:
         if backend == "torch":
             from brmgeo.segment.weights import load_network
 
-            try:
+            # An .onnx of it, made where torch is installed, runs without.
+            with extra("train", f"running {tensors} with torch"):
                 network, card = load_network(tensors)
-            except ImportError:
-                raise MissingInputError(
-                    f"{tensors}: to run it without torch, make an .onnx of it (brmgeo export-onnx) where torch is "
-                    "installed; or pip install 'brmgeo[train]'"
-                ) from None
             runs = _TorchNetwork(network, card.temperature, threads)
             return cls(card, "torch", tensors, runs, card.looks if looks is None else looks)
         if not graph.is_file():
@@ -437,7 +436,7 @@ def _placed(answer: F32, picture: Picture) -> F32:
 def mask_of(probability: F32, threshold: float) -> U8:
     """(h, w) uint8: 255 where ``probability`` is above ``threshold``, else, and where it is NaN, 0."""
     with np.errstate(invalid="ignore"):
-        return np.where(probability > threshold, 255, 0).astype(np.uint8)
+        return np.where(probability > threshold, LABEL_BUILDING, LABEL_OTHER).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import onnx
 import pytest
 from small_networks import bright_onnx, small_card, small_tensors
 
-from brmgeo.errors import InputError
+from brmgeo.errors import InputError, MissingExtraError
 from brmgeo.segment.onnx_export import deepness_metadata, export_onnx, finished
 from brmgeo.segment.predict import Segmenter
 from brmgeo.segment.weights import load_network, load_weights, save_weights
@@ -115,6 +116,15 @@ def test_deepness_opens_the_tile_graph(weights: Path, tmp_path: Path) -> None:
 def test_a_tile_that_the_network_cannot_take_is_refused(weights: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="65 px: this network takes multiples of 2 px"):
         export_onnx(weights, tmp_path / "x.onnx", 65)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_its_packages_the_extra_that_brings_them_is_named(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(MissingExtraError, match=r"ONNX needs onnxscript, .*'brmgeo\[train\]'"):
+        export_onnx(weights, tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())
 
 

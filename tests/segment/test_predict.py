@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from small_networks import bright_onnx, small_card, small_tensors
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import InputError, MissingExtraError, MissingInputError, SettingsError
 from brmgeo.segment import predict
 from brmgeo.segment.predict import Segmenter, mask_of, picture_of, read_image, spans
 from brmgeo.segment.weights import save_weights
@@ -253,6 +253,17 @@ def test_torch_runs_the_same_card(tmp_path: Path) -> None:
     with torch.no_grad():
         logit = network(x.permute(2, 0, 1)[None].float())[0, 0]
     np.testing.assert_allclose(net.probability(image), torch.sigmoid(logit / 1.3).numpy(), atol=1e-5)
+
+
+def test_without_torch_the_extra_that_brings_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(path, small_tensors(), small_card())
+    monkeypatch.setitem(sys.modules, "torch", None)
+    told = r"w\.safetensors with torch needs torch, which is not installed: pip install 'brmgeo\[train\]'"
+    with pytest.raises(MissingExtraError, match=told):
+        Segmenter.load(path)
 
 
 def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
