@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brmgeo.flight.camera import world_from_camera
 from brmgeo.flight.klt import KltTracker
-from brmgeo.flight.motion import motions, yaw_of
+from brmgeo.flight.motion import MotionSource, motions, yaw_of
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu
 from brmgeo.flight.vio import Vio, VioResult, VioSettings, VioStep, run_vio
 from brmgeo.flight.vio.kernels import SIZE, exp, ground_layer, propagate, tie
@@ -344,6 +344,22 @@ def test_clocks_apart_and_a_cold_start_aboard_are_the_whole_flight() -> None:
         else:
             first_at = next(at for at, done in told if done)
             assert first_at == pytest.approx(times[0] + 0.5, abs=0.02)
+
+
+def test_a_program_that_starts_again_takes_no_step_from_its_old_poses_to_the_new() -> None:
+    course, imu = _flown()
+    poses = []
+    for begin, segment in ((0, 0), (20, 1)):
+        vio = Vio(CAMERA, MOUNT, VioSettings(warm_s=0.0), segment=segment)
+        vio.imu(imu.t_s, imu.gyro_rad_s, imu.accel_m_s2)
+        for frame in list(_frames(course, 40))[begin : begin + 20]:
+            vio.frame(*frame)
+            poses.append(vio.pose)
+    assert poses[20] is not None
+    assert np.hypot(*poses[20].xyz_m[:2]) < 0.1  # a new origin, near enough for a step
+    source = MotionSource()
+    steps = [source.motion(p.t_s, p).step_m for p in poses if p is not None]
+    assert [i for i, step in enumerate(steps) if step is None] == [0, 20]
 
 
 def test_the_pose_is_followed_through_the_readings_to_a_frame_that_is_not_finished() -> None:

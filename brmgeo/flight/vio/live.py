@@ -61,6 +61,8 @@ class Vio:
         camera, mount: the camera and how it sits in the body.
         settings: noise and thresholds.
         interval_s: median time between frames, where it is known beforehand; None: that of the first frames.
+        segment: number of the first segment. A program that starts again in flight gives one that it has not had yet: its
+            poses are counted from a new origin, and no motion may be taken from the old ones to them.
 
     When there is a pose. The warm start goes through the first ``settings.warm_s`` (20) seconds twice: their frames are
     held back, and the first pose comes when a frame and readings to ``READ_ON_S`` (2 s) beyond them are there. The call
@@ -85,9 +87,10 @@ class Vio:
         settings: VioSettings | None = None,
         *,
         interval_s: float | None = None,
+        segment: int = 0,
     ) -> None:
         self.camera, self.mount, self.settings = camera, mount, settings or VioSettings()
-        self._interval_s = interval_s
+        self._interval_s, self._segment = interval_s, segment
         self._filter: VioFilter | None = None
         self._newest: VioStep | None = None
         self._waiting: deque[Seen] = deque()
@@ -241,7 +244,13 @@ class Vio:
         variance = vio.step_variance()
         self._walk_m2 = max(self._walk_m2, variance)
         self._newest = VioStep(
-            pose=Pose(frame.t_s, vio.p.copy(), _wxyz(vio.rot), vio.segment, self._walk_m2 + vio.relief_walk),
+            pose=Pose(
+                t_s=frame.t_s,
+                xyz_m=vio.p.copy(),
+                wxyz=_wxyz(vio.rot),
+                segment=self._segment + vio.segment,
+                walk_m2=self._walk_m2 + vio.relief_walk,
+            ),
             velocity_m_s=vio.v.copy(),
             yaw_sigma_rad=math.sqrt(max(0.0, float(vio.cov[TH + 2, TH + 2]))),
             tracks=tracks,
