@@ -43,8 +43,9 @@ def make_odometry(flight_dir: Path, method: Method = "auto") -> dict[str, Any]:
         "tracks": made.tracks,
         "blind": made.blind,
     }
-    track = replace(made.odometry, wxyz=np.round(made.odometry.wxyz, 9))
-    section = write_track(flight_dir, rounded_track(track), stem=stem, columns=columns)
+    track = rounded_track(made.odometry)
+    track = replace(track, wxyz=np.round(track.wxyz, 9))
+    section = write_track(flight_dir, track, stem=stem, columns=columns)
     name_track(flight_dir, section, MADE_BY)
     return facts
 
