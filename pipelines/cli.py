@@ -328,7 +328,7 @@ def train(
     start: Path | None,
 ) -> None:
     """Train the U-Net by a recipe, and test it on REGION, which it never trains on. A killed run is taken up again."""
-    from pipelines import network as job
+    from pipelines import train as job
     from pipelines.regions import recipe_named
 
     path = recipe_named(recipe, data)

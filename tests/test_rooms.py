@@ -56,8 +56,8 @@ ADAPTERS = {
     "brmgeo.flight.tables",
     "brmgeo.flight.video",
     "brmgeo.flight.write",
-    "brmgeo.segment.shards",
     "brmgeo.segment.pairs",
+    "brmgeo.segment.shards",
 }
 # What each room may import besides itself and plain values; everything not named here may not be known.
 MAY_KNOW = {
@@ -79,6 +79,7 @@ MAY_KNOW = {
     "brmgeo.evaluate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.locate", "brmgeo.synth"},
     "brmgeo.synth": VALUES | {"brmgeo.flight", "brmgeo.maps", "brmgeo.ingest"},
     "brmgeo.segment": VALUES | {"brmgeo.maps"},
+    "brmgeo.segment.ground": VALUES | {"brmgeo.segment", "brmgeo.maps", "brmgeo.flight", "brmgeo.synth"},
     "brmgeo.locate": VALUES | {"brmgeo.flight", "brmgeo.match", "brmgeo.segment"},
     "brmgeo.workflow": FOUNDATION | {"brmgeo"},
 }

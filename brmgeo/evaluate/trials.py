@@ -16,13 +16,14 @@ from brmgeo.errors import MissingInputError
 from brmgeo.evaluate.scores import score
 from brmgeo.evaluate.sift import sift_fixes
 from brmgeo.evaluate.table import FlightRow
+from brmgeo.flight.camera import slant_gsd_m
 from brmgeo.flight.readings import FloatArray
 from brmgeo.flight.values import Estimate, View
 from brmgeo.flight.view import make_view
 from brmgeo.geo.grid import Bounds
 from brmgeo.locate.live import locate
 from brmgeo.locate.maps import Maps, match_settings, read_maps
-from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_mask, slant_gsd_m
+from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_mask
 from brmgeo.match import GroundMap
 from brmgeo.region import FlightSettings as RegionFlight
 from brmgeo.synth.flight import (

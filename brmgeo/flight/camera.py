@@ -7,6 +7,8 @@ p1, p2 (OpenCV documentation, "Camera Calibration and 3D Reconstruction").
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,12 @@ def level_from_camera(mount: Attitude, roll_rad: float, pitch_rad: float) -> Flo
 def world_from_camera(mount: Attitude, roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
     """(3, 3) rotation from the optical frame to ENU; yaw counter-clockwise from east."""
     return Attitude(roll_rad, pitch_rad, yaw_rad).matrix() @ mount.body_from_camera()
+
+
+def slant_gsd_m(camera: Camera, mount: Attitude, roll_rad: float, pitch_rad: float, agl_m: float) -> float:
+    """Metres per pixel at the middle of a frame: height over focal length, along the camera's slant."""
+    axis = level_from_camera(mount, roll_rad, pitch_rad)[:, 2]
+    return float(agl_m / math.sqrt(camera.fx * camera.fy) / max(-axis[2], 0.25))
 
 
 def distort(camera: Camera, xy: FloatArray) -> FloatArray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -23,9 +22,8 @@ from numpy.typing import NDArray
 from brmgeo.codes import UNKNOWN
 from brmgeo.errors import FlightError, InputError, MissingInputError
 from brmgeo.files import digest_of, write_bytes
-from brmgeo.flight.camera import level_from_camera
+from brmgeo.flight.camera import slant_gsd_m
 from brmgeo.flight.folder import Flight
-from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.pictures import encode
 from brmgeo.segment.predict import Answer, Picture, Segmenter, mask_of, picture_of, read_image
 from brmgeo.segment.weights import ModelCard
@@ -198,12 +196,6 @@ def network_image(stored: NDArray[np.uint8], threshold: float | None) -> NDArray
     """(h, w) of an answer as it is kept: uint8 0 or 255 by the threshold; without one, float32 probability."""
     probability = probability_of(stored)
     return probability if threshold is None else mask_of(probability, threshold)
-
-
-def slant_gsd_m(camera: Camera, mount: Attitude, roll_rad: float, pitch_rad: float, agl_m: float) -> float:
-    """Metres per pixel at the middle of a frame: height over focal length, along the camera's slant."""
-    axis = level_from_camera(mount, roll_rad, pitch_rad)[:, 2]
-    return float(agl_m / math.sqrt(camera.fx * camera.fy) / max(-axis[2], 0.25))
 
 
 def frame_gsd_m(flight: Flight, index: int) -> float:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from brmgeo.errors import MissingInputError, SettingsError
 from brmgeo.segment.augment import AugmentSettings
@@ -53,13 +53,30 @@ class SourceSpec(BaseModel):
     attribution: str = ""
     licence: str = ""
 
+    @model_validator(mode="after")
+    def _sound(self) -> SourceSpec:
+        if self.kind == "generated" and not self.seeds:
+            raise ValueError("is of kind generated and names no seeds")
+        if self.kind == "flight" and self.split != "test":
+            raise ValueError('a flight is for tests only: split = "test"')
+        if self.roof_m and self.kind != "flight":
+            raise ValueError("roof_m is of flights only; take it out")
+        if self.kind == "pairs" and (self.gsd_m is None or self.split != "train"):
+            raise ValueError("pairs are for training, and need their gsd_m")
+        return self
+
+    @property
+    def asks_for_folder(self) -> bool:
+        """Whether its ground lies in a folder that somebody names."""
+        return self.kind in ("pairs", "xyz", "flight") or (self.kind == "tiles" and not self.regions)
+
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
     """A training run as a file: what is trained, on what, and how.
 
     Pictures of a GSD that was not trained for are resampled to ``work_gsd_m``. Raises SettingsError where that lies outside
-    the crops' GSD, and for a network of other pictures than RGB.
+    the crops' GSD, for a network of other pictures than RGB, and for sources of one name or region.
     """
 
     title: str
@@ -71,6 +88,14 @@ class Recipe:
     augment: AugmentSettings = field(default_factory=AugmentSettings)
 
     def __post_init__(self) -> None:
+        names = [s.name for s in self.source]
+        regions = [region for s in self.source for region in s.regions]
+        if same := [name for name in names if names.count(name) > 1]:
+            raise SettingsError(f"source {same[0]}: two sources have this name; give each its own")
+        if same := [region for region in regions if regions.count(region) > 1]:
+            raise SettingsError(
+                f"region {same[0]} is named twice; its tiles are cut for one purpose, so name it once"
+            )
         if self.unet.in_channels != 3:
             raise SettingsError(
                 f"unet.in_channels {self.unet.in_channels}: pictures have 3, red, green and blue"
