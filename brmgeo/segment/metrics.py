@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from brmgeo.segment.tiles import BUILDING, UNKNOWN
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]

@@ -9,12 +9,10 @@ written), the model card, and a checksum of the whole file. Deepness cannot open
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import json
 import logging
 import math
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,6 +20,7 @@ from typing import Any
 
 from brmgeo.errors import InputError
 from brmgeo.extras import extra
+from brmgeo.files import digest_of, write_bytes
 from brmgeo.segment.weights import ModelCard, load_network
 
 CARD_KEY = "brmgeo_weights"
@@ -39,7 +38,7 @@ def export_onnx(weights: Path, out: Path, tile_px: int | None = None) -> ModelCa
 
     Raises MissingExtraError where the packages are not installed, InputError for bad weights or a size that does not fit.
     """
-    with extra("train", "writing a network as ONNX"):
+    with extra("train", "writing ONNX"):
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
         import torch
@@ -74,9 +73,7 @@ def export_onnx(weights: Path, out: Path, tile_px: int | None = None) -> ModelCa
         )
     assert program is not None
     data = finished(program.model_proto, card, tile_px)
-    part = out.with_name(f".{out.name}.part")
-    part.write_bytes(data)
-    os.replace(part, out)
+    write_bytes(out, data)
     return card
 
 
@@ -115,7 +112,7 @@ def check_seal(data: bytes, name: str) -> None:
     """InputError where the bytes of an ONNX file are not those that ``export_onnx`` wrote."""
     at = data.find(_SEAL)
     if at < 0:
-        raise InputError(f"{name}: not an ONNX file of brmgeo; give one that brmgeo export-onnx wrote")
+        raise InputError(f"{name}: not an ONNX file of brmgeo; give one that brmgeo wrote")
     if data[at + len(_SEAL) : at + len(_SEAL) + 64] != _seal_of(data).encode():
         raise InputError(
             f"{name}: not the bytes that were written (SHA-256 differs): damaged or changed; copy the file again"
@@ -124,10 +121,7 @@ def check_seal(data: bytes, name: str) -> None:
 
 def _seal_of(data: bytes) -> str:
     at = data.index(_SEAL) + len(_SEAL)
-    whole = hashlib.sha256(data[:at])
-    whole.update(b"0" * 64)
-    whole.update(data[at + 64 :])
-    return whole.hexdigest()
+    return digest_of(data[:at] + b"0" * 64 + data[at + 64 :])
 
 
 def _tidy(model: Any, tile_px: int | None) -> None:

@@ -3,8 +3,8 @@
 A recipe holds the U-Net, the training run, the augmentation, and the sources. A source is ground of one of these kinds:
 
 - ``generated``: towns that brmgeo invents, by seed, painted once and kept in data/work/scenes;
-- ``tiles``: training tiles of regions by name, as ``brmgeo tiles`` cuts them (cut now where they are not as wanted), or,
-  without ``regions``, those in a folder, such as ``brmgeo tiles --pairs`` makes;
+- ``tiles``: training tiles of regions by name (cut now where they are not as wanted), or, without ``regions``, those in a
+  folder, such as tiles made of other people's pairs;
 - ``pairs``: a folder with images/ and masks/ of equal names, small square tiles that are laid into mosaics;
 - ``xyz``: the same, with names that end in X-Y-Z of a web-mercator tile: they are put together as they lie on the ground;
 - ``flight``: a flight folder whose frames have masks; for tests only. Where ``roof_m`` says how high roofs stand, the

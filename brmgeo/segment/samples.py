@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import InputError
 from brmgeo.segment.augment import Source
-from brmgeo.segment.tiles import BUILDING, UNKNOWN
 
 U8 = NDArray[np.uint8]
 Patch = tuple[U8, U8, float, tuple[float, float]]

@@ -30,8 +30,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_OTHER as OTHER
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import InputError, MissingInputError
-from brmgeo.segment import BUILDING, OTHER, SPLITS, UNKNOWN
+from brmgeo.pictures import decode
+from brmgeo.segment import SPLITS
 
 FORMAT, VERSION = "brmgeo-tiles", 1
 TILES_JSON, INDEX_CSV = "tiles.json", "index.csv"
@@ -261,17 +265,15 @@ class TileSet:
             raise InputError(
                 f"{path}: tile {info.key} is damaged or not the one of {INDEX_CSV}; cut the tiles again"
             )
-        image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
-        label = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None or label is None or label.ndim != 2 or image.shape[:2] != label.shape:
-            raise InputError(
-                f"{path}: tile {info.key} is not an image with a label of its size; cut the tiles again"
-            )
-        return np.ascontiguousarray(image[..., ::-1]), np.asarray(label, dtype=np.uint8)
+        name = f"{path}: tile {info.key}"
+        image, label = decode(picture, name, flags=cv2.IMREAD_COLOR), decode(mask, name)
+        if label.ndim != 2 or image.shape[:2] != label.shape:
+            raise InputError(f"{name} is not an image with a label of its size; cut the tiles again")
+        return image, np.asarray(label, dtype=np.uint8)
 
 
 def read_tiles(folder: Path | str) -> TileSet:
-    """The training tiles in a folder that ``brmgeo tiles`` wrote.
+    """The training tiles in a folder with tiles.json.
 
     Raises MissingInputError where there are none, InputError (one line) for another format or version, a damaged index,
     or shards that are gone or of another size than recorded.
@@ -280,7 +282,7 @@ def read_tiles(folder: Path | str) -> TileSet:
     path = folder / TILES_JSON
     if not path.is_file():
         raise MissingInputError(
-            f"{folder}: holds no training tiles ({TILES_JSON} is not there); `brmgeo tiles REGION` cuts them"
+            f"{folder}: holds no training tiles ({TILES_JSON} is not there); name another folder, or cut them first"
         )
     try:
         facts = json.loads(path.read_text(encoding="utf-8"))

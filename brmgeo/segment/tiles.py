@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_OTHER as OTHER
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.geo.grid import Bounds, Window
-from brmgeo.segment import BUILDING as BUILDING
-from brmgeo.segment import OTHER
-from brmgeo.segment import UNKNOWN as UNKNOWN
 
 COARSE = 8  # clouds are looked for in pixels this many times larger
 _BLANK_STD = 2.0  # grey levels: flat water keeps more than this at any GSD, a placeholder picture less

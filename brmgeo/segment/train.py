@@ -33,10 +33,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
 
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import InputError, SettingsError
+from brmgeo.files import digest_of, whole_file
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, draw_crop
 from brmgeo.segment.imagenet import imagenet_weights, start_from_imagenet
-from brmgeo.segment.tiles import BUILDING, UNKNOWN
 from brmgeo.segment.unet import UNet, UNetSettings
 from brmgeo.settings import require_within
 
@@ -268,7 +270,7 @@ class Trainer:
             for name in sorted(initial):
                 whole.update(name.encode() + np.ascontiguousarray(initial[name]).tobytes())
             what["initial"] = whole.hexdigest()
-        self._digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        self._digest = digest_of(json.dumps(what, sort_keys=True))
         gpu = settings.device != "cpu" and torch.cuda.is_available()
         if settings.device == "cuda" and not gpu:
             raise SettingsError("training device cuda: there is no GPU that torch can use; leave it at auto")
@@ -457,14 +459,8 @@ class Trainer:
             "losses": run.losses,
         }
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        new = self._path.with_name(f".{self._path.name}.{os.getpid()}")
-        try:
-            save_file(tensors, new, {"brmgeo": json.dumps(facts)})
-            with new.open("rb") as file:
-                os.fsync(file.fileno())
-            new.replace(self._path)
-        finally:
-            new.unlink(missing_ok=True)
+        with whole_file(self._path, durable=True) as scratch:
+            save_file(tensors, scratch, {"brmgeo": json.dumps(facts)})
 
     def _load(self, run: Run) -> None:
         path = self._path

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -19,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import InputError, MissingInputError
+from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.extras import extra
+from brmgeo.files import write_bytes, write_text
 
 if TYPE_CHECKING:
     from brmgeo.segment.unet import UNet
@@ -28,7 +29,7 @@ FORMAT = 1
 ARCHITECTURE = "brmgeo U-Net"
 _MAGIC = "brmgeo_weights"
 _TYPES = {"float32", "int64"}  # int64: how many batches a batch normalisation has seen
-_NOT_WEIGHTS = "give a .safetensors file that brmgeo train wrote"
+_NOT_WEIGHTS = "give a .safetensors file that training wrote"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +165,8 @@ def save_weights(path: Path, tensors: Mapping[str, NDArray[Any]], card: ModelCar
 
     Returns the card with its checksum. Raises ValueError for other dtypes, InputError for another ending.
     """
-    from safetensors.numpy import save
+    with extra("train", "writing weights"):
+        from safetensors.numpy import save
 
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: weights are written as .safetensors only")
@@ -173,8 +175,8 @@ def save_weights(path: Path, tensors: Mapping[str, NDArray[Any]], card: ModelCar
         if value.dtype.name not in _TYPES:
             raise ValueError(f"tensor {name} is {value.dtype}: weights are float32 or int64")
     card = replace(card, sha256=_checksum(whole, card))
-    _write(path, save(whole, metadata={_MAGIC: card.to_json()}))
-    _write(path.with_suffix(".md"), card.to_markdown(path.stem).encode())
+    write_bytes(path, save(whole, metadata={_MAGIC: card.to_json()}))
+    write_text(path.with_suffix(".md"), card.to_markdown(path.stem))
     return card
 
 
@@ -184,7 +186,8 @@ def load_weights(path: Path) -> tuple[dict[str, NDArray[Any]], ModelCard]:
     Raises MissingInputError where there is no file; InputError, in one line, for a file that is no safetensors file, cut
     short, of another program, format version or architecture, or changed in any byte since it was written.
     """
-    from safetensors import SafetensorError, safe_open
+    with extra("train", "reading .safetensors"):
+        from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
         raise MissingInputError(f"{path}: there are no weights; {_NOT_WEIGHTS}")
@@ -225,10 +228,10 @@ def load_network(path: Path) -> tuple[UNet, ModelCard]:
 
 def build_network(tensors: Mapping[str, NDArray[Any]], card: ModelCard, name: str) -> UNet:
     """The network of a card with these tensors in it, in evaluation mode; InputError where they do not fit each other."""
-    import torch
+    with extra("train", "running the network in torch"):
+        import torch
 
-    from brmgeo.errors import SettingsError
-    from brmgeo.segment.unet import UNet, UNetSettings
+        from brmgeo.segment.unet import UNet, UNetSettings
 
     known = {f.name for f in fields(UNetSettings)}
     # Cards of before there was a choice of encoder do not name it.
@@ -261,12 +264,6 @@ def _checksum(tensors: Mapping[str, NDArray[Any]], card: ModelCard) -> str:
         whole.update(f"{name}\0{value.dtype.name}\0{value.shape}\0".encode())
         whole.update(value.tobytes())
     return whole.hexdigest()
-
-
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_bytes(data)
-    os.replace(part, path)
 
 
 def _number(value: Any) -> bool:

