@@ -19,7 +19,7 @@ from brmgeo.workflow.plan import StepStatus
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.publish import publish
 from brmgeo.workflow.schedule import scheduler
-from brmgeo.workflow.store import Artifact, Step, Store
+from brmgeo.workflow.store import Artifact, Store
 from pipelines.map_plan import imagery_of, plan_maps
 from pipelines.map_sources import VECTOR_SUFFIXES, NativeImagery, credits, find_sources, finer_imagery
 from pipelines.regions import region_named, safe_name
@@ -169,7 +169,7 @@ def native_imagery(region: MapSettings, data: Path) -> NativeImagery | None:
     if region.imagery is None:
         return None
     inputs, source = imagery_of(region, Store(data / "work"), data / "source" / region.name)
-    places = {name: item.path if isinstance(item, Step) else Path(item) for name, item in inputs.items()}
+    places = {n: Path(i) if isinstance(i, str | Path) else i.path for n, i in inputs.items()}
     return finer_imagery(region, source, source.root(places))
 
 

@@ -165,7 +165,7 @@ def cut_pairs(
                 "--split test, or other pictures"
             )
     safe = safe_name(name)
-    pairs = [(f"{safe}-{stem}", *files) for stem, *files in _paired(images, masks)]
+    pairs = [(f"{safe}-{stem}", image, mask) for stem, image, mask in _paired(images, masks)]
     progress = Progress()
     with results_folder(out, safe), (store := Store(out / ".brmgeo")).lock(safe):
         plan = Plan(store, safe)

@@ -60,12 +60,9 @@ def plan_tiles(
     rules = _survey_settings(region, source, data, align)
     survey = plan.add(SURVEY, inputs, rules)
     names = _add_shards(plan, region, inputs | {"survey": survey}, rules)
-    shards = {name: plan.steps[label] for label, name in names.items()}
-    plan.add(
-        INDEX,
-        {"survey": survey, "alignment": alignment} | shards,
-        _index_settings(region, rules, tuple(names.values())),
-    )
+    listed: dict[str, Input] = {"survey": survey, "alignment": alignment}
+    listed |= {name: plan.steps[label] for label, name in names.items()}
+    plan.add(INDEX, listed, _index_settings(region, rules, tuple(names.values())))
     return plan, names
 
 
