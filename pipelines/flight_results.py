@@ -33,7 +33,7 @@ from brmgeo.flight.folder import Flight
 from brmgeo.flight.own import odometry_name
 from brmgeo.flight.values import Estimate
 from brmgeo.geo.raster import read_overview
-from brmgeo.locate.live import Located, view_at
+from brmgeo.locate.flights import Located, view_at
 from brmgeo.locate.maps import Maps
 from brmgeo.locate.masks import FrameMasks
 from brmgeo.match import MatchSettings

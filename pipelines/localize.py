@@ -8,7 +8,7 @@ from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.files import require_replaceable, whole_folder
 from brmgeo.flight.folder import Flight
 from brmgeo.flight.own import own_odometry
-from brmgeo.locate.live import locate_flight
+from brmgeo.locate.flights import locate_flight
 from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import NetworkUse, frame_masks
 from brmgeo.match import METHODS

@@ -21,6 +21,7 @@ from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, make_flig
 
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.match import METHODS
+from brmgeo.segment.predict import Segmenter
 from brmgeo.synth.flight import FlightSettings, Ground, Imagery, simulate
 from pipelines.cli import cli, run
 
@@ -174,3 +175,17 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         yield path
     finally:
         subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The shape of every picture that a network has been asked about."""
+    seen: list[tuple[int, ...]] = []
+    own = Segmenter.probabilities
+
+    def counted(self: Segmenter, images: list, gsds: list) -> list:
+        seen.extend(i.rgb.shape for i in images)
+        return own(self, images, gsds)
+
+    monkeypatch.setattr(Segmenter, "probabilities", counted)
+    return seen

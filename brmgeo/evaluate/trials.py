@@ -21,7 +21,7 @@ from brmgeo.flight.readings import FloatArray
 from brmgeo.flight.values import Estimate, View
 from brmgeo.flight.view import make_view
 from brmgeo.geo.grid import Bounds
-from brmgeo.locate.live import locate
+from brmgeo.locate.flights import locate
 from brmgeo.locate.maps import Maps, match_settings, read_maps
 from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_mask
 from brmgeo.match import GroundMap

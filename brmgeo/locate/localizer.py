@@ -143,6 +143,11 @@ class Localizer:
         """
         if not (math.isfinite(t_s) and t_s > self._t_s):
             raise InputError(f"a frame at {t_s} s after one at {self._t_s} s: times must increase")
+        read = [] if pose is None else [*pose.xyz_m, *pose.wxyz]
+        if not all(map(math.isfinite, [*read, 0.0 if compass_yaw_rad is None else compass_yaw_rad])):
+            raise InputError(
+                f"a frame at {t_s} s: its pose or compass is no number: hand in None for unknown"
+            )
         view = self.view(t_s, picture, attitude, agl_m, file=file)
         motion = self._motions.motion(t_s, pose, compass_yaw_rad)
         self._t_s = t_s
@@ -201,7 +206,7 @@ class Localizer:
 
     # --- saved and loaded ----------------------------------------------------------------------------------------
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Writes all that the frames so far have left as one file, whole or not at all, from which ``load`` goes on.
 
         Raises WorkflowError where the disk does not take it.
@@ -215,10 +220,10 @@ class Localizer:
             "ways": asdict(self._ways),
         }
         arrays = within("motion", self._motions.state()) | within("matcher", self._matcher.state())
-        write_saved(path, header, arrays)
+        write_saved(Path(path), header, arrays)
 
     @classmethod
-    def load(cls, path: Path, maps: Maps, *, masks: Segmenter | None = None) -> Localizer:
+    def load(cls, path: Path | str, maps: Maps, *, masks: Segmenter | None = None) -> Localizer:
         """The localizer that ``save`` wrote: what it says of the frames that follow is the same, bit for bit.
 
         Args:
@@ -229,7 +234,7 @@ class Localizer:
         Raises MissingInputError where there is no such file; InputError for one that is damaged or cut short, of another
         version of brmgeo, or of other maps or another network.
         """
-        header, arrays = read_saved(path, _FORMAT)
+        header, arrays = read_saved(Path(path), _FORMAT)
         try:
             camera, mount, ways = header["camera"], header["mount"], dict(header["ways"])
             settings = settings_of(ways.pop("settings"))
@@ -280,7 +285,7 @@ def _checked_mask(mask: NDArray[Any], name: str) -> NDArray[Any]:
             raise InputError(
                 f"{name}: pixel (row {row}, column {col}) is {mask[row, col]}: 0 is other, 255 is building, nothing else"
             )
-    elif mask.dtype not in (np.bool_, np.float32, np.float64):
+    elif mask.dtype not in (np.bool_, np.float32, np.float64) or ((mask < 0) | (mask > 1)).any():
         raise InputError(
             f"{name}: {mask.dtype} values: give bool, uint8 of 0 and 255, or float probability in [0, 1]"
         )

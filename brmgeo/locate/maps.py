@@ -36,8 +36,9 @@ class Maps:
         return (left + right) / 2, (bottom + top) / 2
 
 
-def read_maps(folder: Path) -> Maps:
+def read_maps(folder: Path | str) -> Maps:
     """The maps in a folder; MissingInputError where buildings.tif is not there, InputError where it is no map."""
+    folder = Path(folder)
     path = folder / "buildings.tif"
     if not path.is_file():
         raise MissingInputError(f"{path} is not there; build the maps first")

@@ -20,7 +20,7 @@ from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.motion import Pose, poses_at
 from brmgeo.flight.readings import Attitude
 from brmgeo.flight.values import Estimate
-from brmgeo.locate.live import Located, locate_flight
+from brmgeo.locate.flights import Located, locate_flight
 from brmgeo.locate.localizer import Localizer, usual_reset_speed_m_s
 from brmgeo.locate.maps import Maps, match_settings, read_maps
 from brmgeo.locate.masks import FrameMasks, NetworkUse, frame_masks
@@ -64,7 +64,7 @@ def feed(here: Localizer, flight: Flight, first: int = 0, last: int | None = Non
 
 @pytest.fixture(scope="module")
 def built(maps: Path) -> Maps:
-    return read_maps(maps)
+    return read_maps(str(maps))
 
 
 @pytest.fixture(scope="module")
@@ -153,13 +153,16 @@ def test_a_frame_that_is_refused_changes_nothing(
     bad = mask.copy()
     bad[3, 4] = 7
     t = frame.t_s
+    nowhere = Pose(t, np.array([math.nan, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
     cases: list[tuple[tuple[Any, ...], type[Exception], str]] = [
         ((math.nan, mask, level, 100.0), InputError, "times must increase"),
         ((t, mask[1:], level, 100.0), InputError, "the camera's frames are"),
         ((t, mask[None], level, 100.0), InputError, "the camera's frames are"),
         ((t, bad, level, 100.0), InputError, r"pixel \(row 3, column 4\) is 7"),
         ((t, mask.astype(np.int32), level, 100.0), InputError, "int32 values"),
+        ((t, mask.astype(np.float32), level, 100.0), InputError, r"probability in \[0, 1\]"),
         ((t, mask, Attitude(math.nan), 100.0), InputError, "must be numbers"),
+        ((t, mask, level, 100.0, nowhere), InputError, "hand in None"),
         ((t, mask, level, 0.0), InputError, "above 0"),
         ((t, np.repeat(mask[:, :, None], 3, axis=2), level, 100.0), SettingsError, "no network"),
     ]
@@ -218,8 +221,8 @@ def test_after_loading_all_goes_on_as_if_nothing_had_been(
     for at in (0, 1, 5):
         done = {0: 0, 1: 0, 5: 1}[at]
         feed(here, flight, done, at)
-        here.save(path)
-        here = Localizer.load(path, built)
+        here.save(str(path))
+        here = Localizer.load(str(path), built)
     rest = feed(here, flight, 5)
     assert all(same(a, b) for a, b in zip(rest, wanted[5:], strict=True))
     assert [p.name for p in tmp_path.iterdir()] == ["state.brm"]

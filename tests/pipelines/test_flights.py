@@ -21,7 +21,7 @@ from brmgeo import files
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
 from brmgeo.flight.motion import motions
-from brmgeo.locate.live import locate, locate_flight, view_at
+from brmgeo.locate.flights import locate, locate_flight, view_at
 from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import FrameMasks
 from brmgeo.match import METHODS, GroundMap, MatchSettings, make_matcher
