@@ -8,7 +8,8 @@ from pathlib import Path
 from brmgeo.errors import SettingsError
 from brmgeo.locate.maps import read_maps
 from brmgeo.region import FlightSettings, Region
-from pipelines.regions import region_named, safe_name
+
+from .regions import region_named, safe_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +35,8 @@ def maps_for(
     command: str, region: str | None, maps_dir: Path | None, data: Path, scheduler_spec: str | None
 ) -> BuiltMaps:
     """The maps of a region, built first where they are not fresh, or of a folder; SettingsError for both or neither."""
-    from pipelines.map_sources import credits
-    from pipelines.maps import build_region
+    from .map_sources import credits
+    from .maps import build_region
 
     if (region is None) == (maps_dir is None):
         raise SettingsError(

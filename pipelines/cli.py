@@ -150,7 +150,7 @@ def maps(
     repairs: bool,
 ) -> None:
     """Build all maps of REGION: footprints, imagery, building mask, ratio maps, preview, QGIS project."""
-    from pipelines import maps as job
+    from . import maps as job
 
     if footprints:
         if region is not None:
@@ -238,11 +238,11 @@ def tiles(
     empty_share: float | None,
 ) -> None:
     """Cut training tiles (image + label pairs) of REGIONS, or make them of foreign --pairs."""
-    from pipelines import training as job
-    from pipelines.trainable import require_all_trainable
+    from . import training as job
+    from .trainable import require_all_trainable
 
     if pairs is not None:
-        from pipelines.training_pairs import cut_pairs
+        from .training_pairs import cut_pairs
 
         if regions or align:
             raise SettingsError(
@@ -328,8 +328,8 @@ def train(
     start: Path | None,
 ) -> None:
     """Train the U-Net by a recipe, and test it on REGION, which it never trains on. A killed run is taken up again."""
-    from pipelines import train as job
-    from pipelines.regions import recipe_named
+    from . import train as job
+    from .regions import recipe_named
 
     path = recipe_named(recipe, data)
     folders: dict[str, Path] = {}
@@ -364,8 +364,8 @@ def new_region(
     name: str, data: Path, sheets: str | None, bounds: tuple[float, ...] | None, crs: str, title: str
 ) -> None:
     """Write a region file from sheet numbers or bounds: CRS, extents and sheets are worked out."""
-    from pipelines.maps import missing_sources
-    from pipelines.regions import new_region as write
+    from .maps import missing_sources
+    from .regions import new_region as write
 
     numbers = tuple(s.strip() for s in sheets.split(",") if s.strip()) if sheets else ()
     box = None if bounds is None else (bounds[0], bounds[1], bounds[2], bounds[3])
@@ -381,7 +381,7 @@ def new_region(
 @click.option("--verify", is_flag=True, help="Also hold the contents of all outputs against their records.")
 def status(region: str, data: Path, verify: bool) -> None:
     """Show how each stage of REGION stands: fresh, stale, missing or damaged."""
-    from pipelines import maps, training
+    from . import maps, training
 
     for line in [*maps.status_lines(region, data, verify), *training.status_lines(region, data, verify)]:
         click.echo(line)
@@ -393,7 +393,7 @@ def status(region: str, data: Path, verify: bool) -> None:
 @data_option
 def why(region: str, stage: str, data: Path) -> None:
     """Explain why STAGE of REGION would run again: which setting or input changed."""
-    from pipelines import maps, training
+    from . import maps, training
 
     for line in training.why_lines(region, stage, data) or maps.why_lines(region, stage, data):
         click.echo(line)
@@ -469,9 +469,9 @@ def simulate(
     settings_file: Path | None,
 ) -> None:
     """Simulate a flight over REGION: frames or masks, odometry and reference in one folder; an IMU with frames."""
-    from pipelines import simulate as job
-    from pipelines.built import maps_for
-    from pipelines.maps import native_imagery
+    from . import simulate as job
+    from .built import maps_for
+    from .maps import native_imagery
 
     if out is None and region is None:
         raise SettingsError("simulate --maps: give --out, the flight folder to write")
@@ -594,10 +594,11 @@ def localize(
     from brmgeo.files import plain_name
     from brmgeo.flight.folder import read_flight
     from brmgeo.locate.masks import NetworkUse
-    from pipelines import localize as job
-    from pipelines.built import maps_for
-    from pipelines.regions import note_flown
-    from pipelines.simulate import default_flight
+
+    from . import localize as job
+    from .built import maps_for
+    from .regions import note_flown
+    from .simulate import default_flight
 
     built = maps_for("localize", region, maps_dir, data, scheduler)
     if flight is None:
@@ -708,11 +709,12 @@ def evaluate(
     """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
     from brmgeo.evaluate.trials import Drawn, MaskComparison, Trial
     from brmgeo.synth.mission import PATHS
-    from pipelines import evaluate as job
-    from pipelines.built import maps_for
-    from pipelines.maps import native_imagery
-    from pipelines.regions import note_flown
-    from pipelines.simulate import other_day
+
+    from . import evaluate as job
+    from .built import maps_for
+    from .maps import native_imagery
+    from .regions import note_flown
+    from .simulate import other_day
 
     if results:
         click.echo(job.compare_results(results, out))
@@ -804,7 +806,7 @@ def segment(
     looks: int | None,
 ) -> None:
     """Find the buildings in SOURCE: a flight folder, a folder of images, or a georeferenced raster of any size."""
-    from pipelines import segment as job
+    from . import segment as job
 
     if bands is not None and any(b != int(b) for b in bands):
         raise SettingsError(f"segment: --bands {bands} are numbers of bands, from 1")
@@ -843,7 +845,7 @@ def segment(
 )
 def export(results: Path, what: str, out: Path, crs: str | None) -> None:
     """Write a path or the candidates of RESULTS (a folder that localize wrote) in another format or CRS."""
-    from pipelines import results as job
+    from . import results as job
 
     click.echo(job.export_results(results, what, out, crs))
 
@@ -960,7 +962,8 @@ def import_(
     """Make a flight folder of LOG: a ROS bag, PX4 or ArduPilot log, text of poses, or a folder of geotagged photos."""
     from brmgeo.flight.logs import ImportSettings, LogOptions
     from brmgeo.flight.tables import read_times
-    from pipelines import logs as job
+
+    from . import logs as job
 
     units = tuple(u.strip() for u in (imu_units or "").split(",") if u.strip())
     for unit in units:
@@ -1014,7 +1017,8 @@ def inspect(
     from brmgeo.flight.logs import LogOptions
     from brmgeo.flight.logs.inspect import inspect as look
     from brmgeo.flight.tables import read_times
-    from pipelines import logs as job
+
+    from . import logs as job
 
     options = LogOptions(topic, frame_times_s=read_times(frame_times_s) if frame_times_s else None)
     unread = 0
@@ -1056,7 +1060,7 @@ def inspect(
 @click.option("--every", "every_s", type=float, default=5.0, show_default=True, help="Seconds, with --thin.")
 def odometry(flight: Path, method: str, thin: Path | None, every_s: float) -> None:
     """Make the odometry of FLIGHT (a folder) from its own frames, IMU and height, and write it there."""
-    from pipelines import odometry as job
+    from . import odometry as job
 
     facts = job.make_odometry(flight, job.method_named(method))
     for line in job.summary(facts):

@@ -15,7 +15,8 @@ from brmgeo.match import METHODS
 from brmgeo.region import FlightSettings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import serial_map
-from pipelines.flight_results import FlightResults, is_result, source_of, write_results
+
+from .flight_results import FlightResults, is_result, source_of, write_results
 
 
 def localize(

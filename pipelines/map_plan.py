@@ -11,7 +11,8 @@ from brmgeo.geo.sheets import is_sheet_number
 from brmgeo.region import MapSettings
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.store import Input, Step, Store
-from pipelines.map_sources import (
+
+from .map_sources import (
     ImageryFiles,
     SourceFile,
     credits,
@@ -19,7 +20,7 @@ from pipelines.map_sources import (
     imagery_inputs,
     place_of,
 )
-from pipelines.map_stages import (
+from .map_stages import (
     BUILDINGS,
     FOOTPRINTS,
     IMAGERY,

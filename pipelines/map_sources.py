@@ -23,7 +23,8 @@ from brmgeo.region import ImagerySettings, MapSettings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.stage import unstated
 from brmgeo.workflow.store import Input
-from pipelines.regions import where_to_get
+
+from .regions import where_to_get
 
 if TYPE_CHECKING:
     from brmgeo.ingest.imagery import ImagerySource

@@ -23,8 +23,9 @@ from brmgeo.errors import InputError, SettingsError, listed
 from brmgeo.geo.grid import Bounds, Window, as_bounds, blocks, bounds_of, gsd_of, lattice, shape_of
 from brmgeo.geo.sheets import check_extent, sheet_polygon
 from brmgeo.workflow.stage import Json, Map, Stage, unstated
-from pipelines.map_sources import ImageryFiles, imagery_sources
-from pipelines.regions import town_style
+
+from .map_sources import ImageryFiles, imagery_sources
+from .regions import town_style
 
 if TYPE_CHECKING:
     from brmgeo.ingest.footprints import Footprints

@@ -20,9 +20,10 @@ from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.publish import publish
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.store import Artifact, Store
-from pipelines.map_plan import imagery_of, plan_maps
-from pipelines.map_sources import VECTOR_SUFFIXES, NativeImagery, credits, find_sources, finer_imagery
-from pipelines.regions import region_named, safe_name
+
+from .map_plan import imagery_of, plan_maps
+from .map_sources import VECTOR_SUFFIXES, NativeImagery, credits, find_sources, finer_imagery
+from .regions import region_named, safe_name
 
 PUBLISHED = {
     "footprints": "footprints.gpkg",

@@ -21,8 +21,9 @@ from brmgeo.synth.flight import FlightSettings, OdometryErrors, read_simulation_
 from brmgeo.synth.mission import FineImagery, flight_path, imagery_along, read_ground, simulator_settings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
-from pipelines.maps import native_imagery
-from pipelines.regions import town_style
+
+from .maps import native_imagery
+from .regions import town_style
 
 Mode = Literal["masks", "frames", "both"]
 SIMULATED = frozenset(

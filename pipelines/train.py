@@ -22,10 +22,11 @@ from brmgeo.files import write_bytes, write_json, write_text
 from brmgeo.region import load_region
 from brmgeo.segment.shards import TileSet, read_tiles
 from brmgeo.segment.weights import ModelCard, load_weights
-from pipelines import training
-from pipelines.map_sources import credits
-from pipelines.regions import described_regions, region_named
-from pipelines.trainable import require_all_trainable, require_trainable
+
+from . import training
+from .map_sources import credits
+from .regions import described_regions, region_named
+from .trainable import require_all_trainable, require_trainable
 
 with extra("train", "training a network"):
     from brmgeo.segment import train as engine

@@ -12,8 +12,9 @@ from brmgeo.errors import CrsError, SettingsError, listed
 from brmgeo.geo.crs import transform_bounds
 from brmgeo.geo.grid import Bounds, as_bounds
 from brmgeo.region import Region
-from pipelines.map_sources import place_of
-from pipelines.regions import described_regions, flown_mark, region_named
+
+from .map_sources import place_of
+from .regions import described_regions, flown_mark, region_named
 
 SAME_TOWN_M = 10.0
 

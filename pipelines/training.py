@@ -24,10 +24,11 @@ from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.publish import PUBLISHED, publish
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.store import Artifact, Store
-from pipelines.maps import told_status
-from pipelines.regions import region_named
-from pipelines.trainable import require_all_trainable
-from pipelines.training_plan import plan_tiles
+
+from .maps import told_status
+from .regions import region_named
+from .trainable import require_all_trainable
+from .training_plan import plan_tiles
 
 
 def cut_region(

@@ -20,10 +20,11 @@ from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.stage import Json, Map, Stage
 from brmgeo.workflow.store import Input, Store
-from pipelines.map_stages import Inputs
-from pipelines.regions import safe_name
-from pipelines.training import publish_tiles, results_folder
-from pipelines.training_stages import (
+
+from .map_stages import Inputs
+from .regions import safe_name
+from .training import publish_tiles, results_folder
+from .training_stages import (
     INDEX,
     SURVEY_TILES,
     IndexSettings,

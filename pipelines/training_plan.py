@@ -11,10 +11,11 @@ from brmgeo.region import Region
 from brmgeo.segment.tiles import tile_windows
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.store import Input, Store
-from pipelines.map_plan import plan_maps
-from pipelines.map_sources import ImageryFiles, credits, place_of
-from pipelines.trainable import held_ground
-from pipelines.training_stages import (
+
+from .map_plan import plan_maps
+from .map_sources import ImageryFiles, credits, place_of
+from .trainable import held_ground
+from .training_stages import (
     ALIGNMENT,
     INDEX,
     SURVEY,

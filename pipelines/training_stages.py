@@ -52,8 +52,9 @@ from brmgeo.segment.tiles import (
     tile_windows,
 )
 from brmgeo.workflow.stage import Json, Map, Stage, plain
-from pipelines.map_sources import ImageryFiles, imagery_sources
-from pipelines.map_stages import Inputs, mask_of, read_lattice
+
+from .map_sources import ImageryFiles, imagery_sources
+from .map_stages import Inputs, mask_of, read_lattice
 
 if TYPE_CHECKING:
     from brmgeo.segment.alignment import BlockOffset

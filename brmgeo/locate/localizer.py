@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, SettingsError
 from brmgeo.files import digest_of
+from brmgeo.flight.camera import slant_gsd_m
 from brmgeo.flight.motion import RESET_SPEED_M_S, MotionSource, Pose
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
 from brmgeo.locate.maps import Maps
-from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_image, slant_gsd_m, stored_of
+from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_image, stored_of
 from brmgeo.locate.saved import differs, read_saved, settings_of, write_saved
 from brmgeo.match import MatchSettings, SmoothedPath, make_matcher
 from brmgeo.match.state import under, within
