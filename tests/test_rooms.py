@@ -109,15 +109,20 @@ def modules() -> dict[str, Path]:
     return found
 
 
+def origin(node: ast.ImportFrom, path: Path) -> str:
+    """What names are imported from; a relative import counts from the module's own package."""
+    package = path.relative_to(ROOT).parent.parts
+    above = package[: len(package) - node.level + 1] if node.level else ()
+    return ".".join([*above, *([node.module] if node.module else [])])
+
+
 def imports_of(path: Path) -> set[str]:
     names = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            # A relative import counts from the module's own package.
-            own = path.relative_to(ROOT).parent.parts[: 1 - node.level or None] if node.level else ()
-            base = ".".join([*own, *([node.module] if node.module else [])])
+            base = origin(node, path)
             names |= {base} | {f"{base}.{alias.name}" for alias in node.names}
     return names
 
@@ -182,12 +187,12 @@ def graph() -> dict[str, set[str]]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 named |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                assert not node.level, f"{module} imports by a relative name"
+            elif isinstance(node, ast.ImportFrom):
+                base = origin(node, path)
                 # ``from room import name`` is of the module ``room.name`` where there is one, else of the room's face.
                 for alias in node.names:
-                    inner = f"{node.module}.{alias.name}"
-                    named.add(inner if inner in known else node.module)
+                    inner = f"{base}.{alias.name}"
+                    named.add(inner if inner in known else base)
         found[module] = {name for name in named if name in known and name != module}
     return found
 
