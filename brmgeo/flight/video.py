@@ -17,6 +17,8 @@ class Video:
 
     Pictures are counted by decoding, because seeking lands on key frames in many files: in order each is decoded once;
     going back begins at the first.
+
+    ``rate_hz`` is the pictures a second, ``count`` how many the file says it has, ``size`` their (width, height) in pixels.
     """
 
     def __init__(self, path: Path) -> None:
@@ -24,12 +26,15 @@ class Video:
         self.path = path
         self._capture: Any = None
         self._next = 0
-        self.rate_hz = float(self._opened().get(cv2.CAP_PROP_FPS))
+        capture = self._opened()
+        self.rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+        self.count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
         # What is open stays in its process.
-        return {"path": self.path, "rate_hz": self.rate_hz, "_capture": None, "_next": 0}
+        return self.__dict__ | {"_capture": None, "_next": 0}
 
     @property
     def is_open(self) -> bool:
@@ -59,11 +64,11 @@ class Video:
 
     def _opened(self) -> Any:
         if not self.path.is_file():
-            raise FlightError(f"{self.path}: the video is missing: [frames] video in flight.toml names it")
+            raise FlightError(f"{self.path}: the video is missing")
         self._capture = cv2.VideoCapture(str(self.path))
         if not self._capture.isOpened() or self._capture.get(cv2.CAP_PROP_FPS) <= 0:
             self.close()
             raise FlightError(
-                f"{self.path}: no readable video: convert it (for example to H.264 in .mp4) or give frames/"
+                f"{self.path}: no readable video: convert it (for example to H.264 in .mp4) or give pictures"
             )
         return self._capture

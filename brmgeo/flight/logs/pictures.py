@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from brmgeo.errors import FlightError
 from brmgeo.flight.logs import read_log
 from brmgeo.flight.logs.values import ImportSettings, Log
 from brmgeo.flight.readings import Camera, FloatArray
+from brmgeo.flight.video import Video
 from brmgeo.pictures import encode
 
 
@@ -83,13 +83,10 @@ def pictures_of(path: Path, log: Log, settings: ImportSettings) -> Pictures | No
 def _video(path: Path, log: Log, settings: ImportSettings) -> Pictures:
     video = settings.video
     assert video is not None
-    capture = cv2.VideoCapture(str(video))
-    rate, count = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    capture.release()
-    if rate <= 0 or count <= 0:
-        raise FlightError(f"{video}: no readable video: convert it (for example to H.264 in .mp4)")
-    t = settings.video_start_s + np.arange(count) / rate
+    film = Video(video)
+    if film.count <= 0:
+        raise FlightError(f"{video}: the video does not tell how many pictures it has: convert it")
+    t = settings.video_start_s + np.arange(film.count) / film.rate_hz
     if log.odometry is not None and (t[0] > log.odometry.t_s[-1] or t[-1] < log.odometry.t_s[0]):
         raise FlightError(
             f"{path}: the log covers {log.odometry.t_s[0]:.1f} to {log.odometry.t_s[-1]:.1f} s, the video {t[0]:.1f} to "
@@ -100,4 +97,4 @@ def _video(path: Path, log: Log, settings: ImportSettings) -> Pictures:
     def write(folder: Path, wanted: dict[int, str]) -> None:
         shutil.copyfile(video, folder.parent / video.name)
 
-    return Pictures(t, tuple(f"{i:06d}" for i in range(count)), size, write, video)
+    return Pictures(t, tuple(f"{i:06d}" for i in range(film.count)), film.size, write, video)
