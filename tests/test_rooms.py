@@ -92,6 +92,7 @@ ONLY_IN = {
     "onnx": {"brmgeo.segment"},
     "onnxscript": {"brmgeo.segment"},
     "onnxruntime": {"brmgeo.segment"},
+    "ezdxf": {"brmgeo.ingest.dxf", "brmgeo.synth"},
     "httpx": {"brmgeo.ingest"},
     "rosbags": {"brmgeo.flight.logs"},
     "pyulog": {"brmgeo.flight.logs"},
