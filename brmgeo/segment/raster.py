@@ -21,7 +21,7 @@ from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
-from brmgeo.errors import InputError, SettingsError
+from brmgeo.errors import InputError, SettingsError, one_line
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.geo.grid import Window
 from brmgeo.segment.predict import (
@@ -188,7 +188,7 @@ class RasterReader:
         try:
             yield
         except (RasterioError, CPLE_BaseError) as error:
-            told = " ".join(str(error).split())[:200]
+            told = one_line(error, 200)
             raise InputError(f"{self._path}: damaged or cut short ({told}); copy it again") from None
 
 

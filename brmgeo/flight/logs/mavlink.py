@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brmgeo.codes import GRAVITY_M_S2
-from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.errors import FlightError, MissingInputError, one_line
 from brmgeo.extras import extra
 from brmgeo.flight.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, quaternion_from_euler
 from brmgeo.flight.logs.values import Gnss, Height, Log, LogOptions, Orientation, choose, mixed
@@ -94,7 +94,7 @@ def library(path: Path) -> Iterator[Any]:
     except FlightError:
         raise
     except Exception as error:  # damaged bytes make the library raise nearly anything
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        reason = one_line(error, 120)
         raise FlightError(
             f"{path}: no readable ArduPilot log ({reason}): download it from the vehicle again"
         ) from None

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import BrmgeoError, FlightError, InputError, MissingInputError
+from brmgeo.errors import BrmgeoError, FlightError, InputError, MissingInputError, one_line
 from brmgeo.extras import extra
 from brmgeo.flight.logs.values import (
     CameraFrames,
@@ -107,7 +107,7 @@ def _open(path: Path) -> Iterator[Any]:
     except BrmgeoError:
         raise
     except Exception as error:  # damaged bytes make the library raise nearly anything
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        reason = one_line(error, 160)
         raise FlightError(
             f"{path}: the bag is damaged, cut short or not indexed ({reason}): recover it with 'rosbag reindex' (ROS 1), "
             "'ros2 bag reindex' or 'mcap recover', or record it again"

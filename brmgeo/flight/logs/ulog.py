@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.errors import FlightError, MissingInputError, one_line
 from brmgeo.extras import extra
 from brmgeo.flight.frames import (
     enu_flu_from_ned_frd,
@@ -59,7 +59,7 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
         ):  # the library reports damage by printing
             log = ULog(file)
     except Exception as error:  # damaged bytes make the library raise nearly anything
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        reason = one_line(error, 120)
         raise FlightError(
             f"{path}: no readable ULog ({reason}): download it from the vehicle again"
         ) from None
