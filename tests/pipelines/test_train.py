@@ -256,6 +256,8 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: dict[str, Any] = {}
     monkeypatch.setattr(job, "train", lambda *args, **kw: seen.update(args=args, **kw))
+    (tmp_path / "recipes").mkdir()
+    (tmp_path / "recipes" / "short.toml").touch()
     cli(["train", "demo", "--data", str(tmp_path), "--source", "a=b", "--steps", "5"], standalone_mode=False)
     assert seen["args"] == (tmp_path / "recipes" / "short.toml", tmp_path, tmp_path / "out" / "demo" / "unet")
     assert (seen["paths"], seen["test_regions"], seen["steps"]) == ({"a": Path("b")}, ("demo",), 5)
