@@ -30,7 +30,7 @@ from affine import Affine
 from shapely.geometry import Polygon
 
 from brmgeo.match import METHODS, GroundMap, make_matcher
-from brmgeo.synth.flight import Ground, SimulatedViews, place, rectangle, simulate_views
+from brmgeo.synth.flight import RaisedFootprints, SimulatedViews, place, rectangle, simulate_views
 
 GSD_M = 0.5
 REAL = Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
@@ -187,7 +187,7 @@ def main() -> None:
         polygons = [p for p in gpd.read_file(sheet).geometry if p is not None and not p.is_empty]
     else:
         sheet, polygons = Path("a generated town"), list(generated_town())
-    ground, real = raster(polygons), Ground.from_polygons(polygons)
+    ground, real = raster(polygons), RaisedFootprints.from_polygons(polygons)
     h, w = ground.building.shape
     print(f"{sheet.name}: {w * GSD_M:.0f} x {h * GSD_M:.0f} m, seeds from {options.first_seed}\n")
     if options.large:

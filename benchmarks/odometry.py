@@ -33,7 +33,7 @@ from brmgeo.flight.camera import ray_from_pixel
 from brmgeo.flight.motion import MIN_STEP_NOISE_M
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.flight.vio import VioResult, VioSettings, run_vio
-from brmgeo.synth.flight import Course, FlightSettings, Imagery, Simulator, fly, imu_of, rectangle
+from brmgeo.synth.flight import Course, Imagery, SimulationSettings, Simulator, fly, imu_of, rectangle
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "docs" / "odometry.md"
@@ -89,8 +89,8 @@ CONDITIONS = [
 ]  # fmt: skip
 
 
-def settings_of(condition: Condition) -> FlightSettings:
-    base = FlightSettings(frame_interval_s=1.0 / condition.hz, turn_radius_m=12.0, exposure_s=0.0)
+def settings_of(condition: Condition) -> SimulationSettings:
+    base = SimulationSettings(frame_interval_s=1.0 / condition.hz, turn_radius_m=12.0, exposure_s=0.0)
     return replace(base, **condition.flight)
 
 
@@ -103,7 +103,7 @@ def place_of(seed: int, extent: tuple[float, float, float, float]) -> Any:
 
 
 def draw_flat(
-    course: Course, settings: FlightSettings, imagery: Imagery, condition: Condition, seed: int
+    course: Course, settings: SimulationSettings, imagery: Imagery, condition: Condition, seed: int
 ) -> Iterator[Any]:
     """Grey frames of the imagery on flat ground (or on hills), through lens, shutter, contrast and noise."""
     camera = settings.camera
@@ -146,13 +146,15 @@ def draw_flat(
         yield np.asarray(cv2.convertScaleAbs(np.maximum(light, 0.0)), dtype=np.uint8)
 
 
-def _camera_at(course: Course, settings: FlightSettings, bore: Any, when: float) -> tuple[Any, Any]:
+def _camera_at(course: Course, settings: SimulationSettings, bore: Any, when: float) -> tuple[Any, Any]:
     place = np.array([np.interp(when, course.t_s, course.xyz_m[:, k]) for k in range(3)])
     roll, pitch, yaw = (np.interp(when, course.t_s, course.roll_pitch_yaw[:, k]) for k in range(3))
     return place, Attitude(roll, pitch, yaw).matrix() @ bore @ settings.mount.body_from_camera()
 
 
-def _homography(course: Course, settings: FlightSettings, imagery: Imagery, bore: Any, when: float) -> Any:
+def _homography(
+    course: Course, settings: SimulationSettings, imagery: Imagery, bore: Any, when: float
+) -> Any:
     # Imagery pixel from frame pixel, both with whole numbers at centres.
     place, cam = _camera_at(course, settings, bore, when)
     lens = settings.camera
@@ -170,7 +172,7 @@ def _homography(course: Course, settings: FlightSettings, imagery: Imagery, bore
 
 def _footpoints(
     course: Course,
-    settings: FlightSettings,
+    settings: SimulationSettings,
     imagery: Imagery,
     rays: Any,
     bore: Any,

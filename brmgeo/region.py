@@ -94,7 +94,7 @@ class ImagerySettings(_Settings):
         return self
 
 
-class RatioSettings(_Settings):
+class RatioMapSettings(_Settings):
     """Radii of the ratio maps: given in metres, or from n, AGL and field of view by eq. 3."""
 
     radii_m: tuple[Positive, ...] | None = None
@@ -103,7 +103,7 @@ class RatioSettings(_Settings):
     fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> RatioSettings:
+    def _one_way(self) -> RatioMapSettings:
         derived = (self.n, self.agl_m, self.fov_deg)
         if self.radii_m is not None:
             if any(v is not None for v in derived):
@@ -211,7 +211,7 @@ class MapSettings(_Settings):
     sheets: tuple[str, ...] = ()
     footprints: FootprintsSettings = FootprintsSettings()
     imagery: ImagerySettings | None = None
-    ratio: RatioSettings = RatioSettings(n=3, agl_m=150.0, fov_deg=43.0)
+    ratio: RatioMapSettings = RatioMapSettings(n=3, agl_m=150.0, fov_deg=43.0)
     generate: GenerateSettings | None = None
 
     @field_validator("sheets")

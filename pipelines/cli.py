@@ -707,7 +707,7 @@ def evaluate(
     out: Path | None,
 ) -> None:
     """Fly many simulated flights over REGION through the matchers, or compare --results, side by side."""
-    from brmgeo.evaluate.trials import Drawn, MaskComparison, Trial
+    from brmgeo.evaluate.trials import FrameSource, MaskComparison, Trial
     from brmgeo.synth.mission import PATHS
 
     from . import evaluate as job
@@ -744,13 +744,13 @@ def evaluate(
     if season is not None and (region is None or not (sift or "network" in kinds)):
         raise SettingsError("evaluate --season: needs a generated REGION, and --sift or --masks network")
     with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
-        drawn = Drawn()
+        drawn = FrameSource()
         if season is not None and built.region is not None:
             file = Path(scratch) / "other-day.tif"
             other_day(built.region, built.folder, season, first_seed, file)
-            drawn = Drawn(imagery=file, season=season)
+            drawn = FrameSource(imagery=file, season=season)
         elif built.region is not None and (kinds or sift):
-            drawn = Drawn(native=native_imagery(built.region, data))
+            drawn = FrameSource(native=native_imagery(built.region, data))
         first = Trial(
             maps_dir=built.folder.absolute(),
             own=built.flight,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brmgeo.evaluate.figures import (
     Background,
     Paths,
-    Seen,
+    SeenFrame,
     curves_figure,
     first_candidates_figure,
     map_below,
@@ -155,14 +155,14 @@ def write_results(folder: Path, final: Path, results: FlightResults) -> None:
 
 
 def _write_paths(folder: Path, results: FlightResults) -> None:
-    from brmgeo.export.trajectory import Track, write_trajectory
+    from brmgeo.export.trajectory import TimedPath, write_trajectory
 
     flight, smoothed, truth = results.flight, results.located.smoothed, results.truth
     known = np.isfinite(smoothed.xy).all(axis=1)
     agl = np.array([frame.agl_m for frame in flight.frames])
     track = reference = None
     if known.any():
-        track = Track(
+        track = TimedPath(
             t_s=smoothed.t_s[known],
             xy=smoothed.xy[known],
             yaw_rad=smoothed.yaw_rad[known],
@@ -172,7 +172,9 @@ def _write_paths(folder: Path, results: FlightResults) -> None:
         )
     if truth is not None:
         seen = np.isfinite(truth).all(axis=1)
-        reference = Track(flight.times_s[seen], truth[seen], segment=np.cumsum(~seen, dtype=np.int64)[seen])
+        reference = TimedPath(
+            flight.times_s[seen], truth[seen], segment=np.cumsum(~seen, dtype=np.int64)[seen]
+        )
     write_trajectory(
         folder,
         results.located.estimates,
@@ -276,7 +278,7 @@ def how_many(estimate: Estimate) -> str:
     return "Every place that fits" if shown >= count else f"{shown:,} of the {count:,} places that fit"
 
 
-def _seen(maps: Maps, masks: FrameMasks, estimates: Sequence[Estimate]) -> list[Seen]:
+def _seen(maps: Maps, masks: FrameMasks, estimates: Sequence[Estimate]) -> list[SeenFrame]:
     """Four frames: spread over the fixes, or over the flight where there is none."""
     flight = masks.flight
     fixed = [i for i, e in enumerate(estimates) if e.status == "converged"]
@@ -287,7 +289,7 @@ def _seen(maps: Maps, masks: FrameMasks, estimates: Sequence[Estimate]) -> list[
         view, estimate = view_at(flight, maps.ground.gsd_m, i, masks), estimates[i]
         at_fix = estimate.status == "converged" and math.isfinite(estimate.yaw_rad)
         out.append(
-            Seen(
+            SeenFrame(
                 f"frame {i + 1}, {estimate.t_s - estimates[0].t_s:.0f} s, {estimate.status}",
                 flight.image(i) if flight.has_images else None,
                 view.building,

@@ -15,9 +15,8 @@ from brmgeo.files import digest, require_replaceable, whole_folder, write_text
 from brmgeo.flight.folder import may_be_remade
 from brmgeo.geo.raster import box_of
 from brmgeo.locate.maps import Maps, read_maps
-from brmgeo.region import FlightSettings as RegionFlight
-from brmgeo.region import Region
-from brmgeo.synth.flight import FlightSettings, OdometryErrors, read_simulation_settings, simulate
+from brmgeo.region import FlightSettings, Region
+from brmgeo.synth.flight import OdometryErrors, SimulationSettings, read_simulation_settings, simulate
 from brmgeo.synth.mission import FineImagery, flight_path, imagery_along, read_ground, simulator_settings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
@@ -50,7 +49,7 @@ class Simulation:
     """
 
     maps_dir: Path
-    own: RegionFlight
+    own: FlightSettings
     path: str = "rectangle"
     mode: Mode = "masks"
     scale_bias: float | None = None
@@ -61,7 +60,7 @@ class Simulation:
     native: FineImagery | None = None
     settings_file: Path | None = None
 
-    def settings(self) -> FlightSettings:
+    def settings(self) -> SimulationSettings:
         """The simulator's settings: the region's, then the file's, then the options'; SettingsError for a bad file."""
         made = simulator_settings(self.own)
         if self.settings_file is not None:

@@ -31,7 +31,7 @@ from .trainable import require_all_trainable, require_trainable
 with extra("train", "training a network"):
     from brmgeo.segment import train as engine
     from brmgeo.segment.finish import finish
-    from brmgeo.segment.ground import Ground, gather
+    from brmgeo.segment.ground import TrainingGround, gather
     from brmgeo.segment.imagenet import imagenet_weights
     from brmgeo.segment.metrics import LogitHistogram
     from brmgeo.segment.recipe import Recipe, SourceSpec, read_recipe
@@ -48,7 +48,7 @@ def ground_of(
     paths: Mapping[str, Path],
     test_regions: Sequence[str],
     say: Callable[[str], None],
-) -> Ground:
+) -> TrainingGround:
     """The ground of a recipe's sources, all looked at before the first is painted or read.
 
     Args:

@@ -22,7 +22,7 @@ from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, make_flig
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.match import METHODS
 from brmgeo.segment.predict import Segmenter
-from brmgeo.synth.flight import FlightSettings, Ground, Imagery, simulate
+from brmgeo.synth.flight import Imagery, RaisedFootprints, SimulationSettings, simulate
 from pipelines.cli import cli, run
 
 
@@ -128,7 +128,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert isinstance(grey, np.ndarray)
     rgb = np.clip(128 + 45 * grey / grey.std(), 0, 255).astype(np.uint8)
     imagery = Imagery(np.repeat(rgb[:, :, None], 3, axis=2), -140.0, 140.0, 0.4)
-    settings = FlightSettings(
+    settings = SimulationSettings(
         camera=Camera.from_fov(240, 180, 43.0),
         mount=Attitude(),
         agl_m=100.0,
@@ -139,7 +139,14 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = np.array([[-50.0, -20.0], [20.0, -20.0], [20.0, 10.0]])
     out = tmp_path_factory.mktemp("flight") / "f"
     return simulate(
-        out, Ground.from_polygons([]), path, "EPSG:5187", settings, 1, mode="frames", imagery=imagery
+        out,
+        RaisedFootprints.from_polygons([]),
+        path,
+        "EPSG:5187",
+        settings,
+        1,
+        mode="frames",
+        imagery=imagery,
     )
 
 

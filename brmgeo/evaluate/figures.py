@@ -160,7 +160,7 @@ def shrinking_figure(
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SeenFrame:
     """One frame as the camera and the matcher saw it.
 
     Attributes:
@@ -192,7 +192,7 @@ def map_below(ground: GroundMap, view: View, xy: NDArray[np.float64], yaw_rad: f
     return out
 
 
-def seen_figure(frames: Sequence[Seen]) -> bytes:
+def seen_figure(frames: Sequence[SeenFrame]) -> bytes:
     """PNG: one row a frame: the camera's picture, its levelled building mask, and the map at the fix with the mask on it."""
     with mpl.rc_context(_STYLE):
         pictures = any(f.picture is not None for f in frames)

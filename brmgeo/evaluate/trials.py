@@ -25,13 +25,13 @@ from brmgeo.locate.flights import locate
 from brmgeo.locate.maps import Maps, match_settings, read_maps
 from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_mask
 from brmgeo.match import GroundMap
-from brmgeo.region import FlightSettings as RegionFlight
+from brmgeo.region import FlightSettings
 from brmgeo.synth.flight import (
     Course,
-    FlightSettings,
-    Ground,
     MaskErrors,
     OdometryErrors,
+    RaisedFootprints,
+    SimulationSettings,
     Simulator,
     fly,
     simulate_views,
@@ -74,7 +74,7 @@ class MaskComparison:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class FrameSource:
     """What the frames of simulated flights are drawn from.
 
     Attributes:
@@ -105,7 +105,7 @@ class Trial:
     """
 
     maps_dir: Path
-    own: RegionFlight
+    own: FlightSettings
     seed: int
     methods: tuple[str, ...]
     path: str = "rectangle"
@@ -113,7 +113,7 @@ class Trial:
     hide: Side | None = None
     masks: MaskComparison | None = None
     sift: bool = False
-    drawn: Drawn = Drawn()
+    drawn: FrameSource = FrameSource()
 
 
 def fly_trial(trial: Trial) -> list[FlightRow]:
@@ -167,9 +167,9 @@ class _Scene:
 
     trial: Trial
     maps: Maps
-    ground: Ground
+    ground: RaisedFootprints
     route: FloatArray
-    settings: FlightSettings
+    settings: SimulationSettings
 
     @cached_property
     def course(self) -> Course:
@@ -229,7 +229,7 @@ class _Scene:
             )
         return out, seconds
 
-    def _simulator(self, settings: FlightSettings) -> Simulator:
+    def _simulator(self, settings: SimulationSettings) -> Simulator:
         return Simulator(self.ground, settings, self.course, self.trial.seed)
 
     def _pictures(self) -> Iterator[NDArray[np.uint8]]:

@@ -30,7 +30,7 @@ FIXES_HEADER = (
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class TimedPath:
     """Positions in order of time.
 
     Attributes:
@@ -79,8 +79,8 @@ def write_trajectory(
     crs: str,
     *,
     start_utc: datetime | None = None,
-    smoothed: Track | None = None,
-    reference: Track | None = None,
+    smoothed: TimedPath | None = None,
+    reference: TimedPath | None = None,
     z_m: NDArray[np.float64] | None = None,
     height_reference: str = "",
 ) -> list[Path]:
@@ -113,11 +113,11 @@ def write_trajectory(
     return written
 
 
-def converged_track(estimates: Sequence[Estimate], z_m: NDArray[np.float64] | None = None) -> Track:
+def converged_track(estimates: Sequence[Estimate], z_m: NDArray[np.float64] | None = None) -> TimedPath:
     """The fixes of the converged estimates; ``z_m`` (n,) float64 is the height at each of all the estimates."""
     keep = [i for i, e in enumerate(estimates) if e.position is not None]
     places = [estimates[i].position or (0.0, 0.0, 0.0) for i in keep]
-    return Track(
+    return TimedPath(
         np.array([estimates[i].t_s for i in keep], dtype=np.float64),
         np.array([p[:2] for p in places], dtype=np.float64).reshape(-1, 2),
         np.array([estimates[i].yaw_rad for i in keep], dtype=np.float64),
@@ -174,8 +174,8 @@ def write_path_geojson(
     estimates: Sequence[Estimate],
     crs: str,
     start_utc: datetime | None = None,
-    smoothed: Track | None = None,
-    reference: Track | None = None,
+    smoothed: TimedPath | None = None,
+    reference: TimedPath | None = None,
 ) -> Path:
     """``trajectory.geojson`` (RFC 7946): lines of each path, then points with their time, status and sigma.
 
@@ -187,8 +187,8 @@ def write_path_geojson(
 
 
 def _tracks(
-    estimates: Sequence[Estimate], smoothed: Track | None, reference: Track | None
-) -> list[tuple[str, Track, list[slice]]]:
+    estimates: Sequence[Estimate], smoothed: TimedPath | None, reference: TimedPath | None
+) -> list[tuple[str, TimedPath, list[slice]]]:
     # Name, points and unbroken stretches of each path that there is.
     whole = (("smoothed", smoothed), ("reference", reference))
     online = ("online", converged_track(estimates), _runs(estimates))
@@ -199,8 +199,8 @@ def _path_features(
     estimates: Sequence[Estimate],
     crs: str,
     start_utc: datetime | None,
-    smoothed: Track | None,
-    reference: Track | None,
+    smoothed: TimedPath | None,
+    reference: TimedPath | None,
 ) -> Iterator[str]:
     epsg = epsg_of(crs) or "null"
     tracks = _tracks(estimates, smoothed, reference)
@@ -238,8 +238,8 @@ def write_path_gpkg(
     files: Sequence[str],
     crs: str,
     start_utc: datetime | None = None,
-    smoothed: Track | None = None,
-    reference: Track | None = None,
+    smoothed: TimedPath | None = None,
+    reference: TimedPath | None = None,
 ) -> Path:
     """``trajectory.gpkg`` in ``crs``: points in ``online``, ``smoothed`` and ``reference``, lines in ``*_path``; returned.
 
@@ -286,7 +286,7 @@ def write_path_gpkg(
 
 def write_tum(
     path: Path,
-    track: Track,
+    track: TimedPath,
     crs: str,
     *,
     path_name: str,
@@ -344,7 +344,7 @@ def _runs(estimates: Sequence[Estimate]) -> list[slice]:
 
 
 def _spans(
-    track: Track, estimates: Sequence[Estimate] | None, start_utc: datetime | None
+    track: TimedPath, estimates: Sequence[Estimate] | None, start_utc: datetime | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last millisecond of each point. An online fix ends with its frame, not with the next fix."""
     if estimates is None:

@@ -32,7 +32,14 @@ from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
 from brmgeo.ingest.dxf import MAX_DROPPED_SHARE, SNAP_M, read_dxf
 from brmgeo.ingest.groups import grouped
-from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings, shape_keys
+from brmgeo.ingest.repair import (
+    DROPPED_KINDS,
+    ClosedOutlines,
+    Repair,
+    repair_counts,
+    repair_rings,
+    shape_keys,
+)
 
 with extra("maps", "reading footprints"):
     import geopandas as gpd
@@ -337,7 +344,7 @@ def _from_vector(
     name = layer or path.stem
     handles = np.array([str(i + 1) for i in row.tolist()], dtype=object)
     repaired = repair_rings(
-        Rings(polygons, np.full(len(row), name, dtype=object), handles), path.name, courtyards=False
+        ClosedOutlines(polygons, np.full(len(row), name, dtype=object), handles), path.name, courtyards=False
     )
     repairs = list(repaired.repairs)
     for i in open_rows:

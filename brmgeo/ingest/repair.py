@@ -50,7 +50,7 @@ class Repair:
 
 
 @dataclass(slots=True)
-class Rings:
+class ClosedOutlines:
     """Closed outlines before repair: parallel arrays, one element an outline.
 
     Attributes:
@@ -81,7 +81,7 @@ class Repaired:
     courtyards: int = 0
 
 
-def repair_rings(rings: Rings, source: str = "", courtyards: bool = True) -> Repaired:
+def repair_rings(rings: ClosedOutlines, source: str = "", courtyards: bool = True) -> Repaired:
     """Valid polygons from closed outlines: spikes cut, crossings split, duplicates and empty ones out, courtyards in.
 
     Args:
@@ -144,7 +144,9 @@ def shape_keys(polygons: NDArray[np.object_], decimals: int = _SAME_DECIMALS) ->
     return list(shapely.to_wkb(cleaned))
 
 
-def _repair(kind: str, rings: Rings, i: int, at: tuple[float, float], detail: str, source: str) -> Repair:
+def _repair(
+    kind: str, rings: ClosedOutlines, i: int, at: tuple[float, float], detail: str, source: str
+) -> Repair:
     return Repair(kind, str(rings.handles[i]), str(rings.layers[i]), at[0], at[1], detail, source)
 
 
@@ -203,7 +205,7 @@ def _without_spikes(polygon: shapely.Polygon) -> tuple[shapely.Polygon | None, t
 
 
 def _made_valid(
-    polygons: NDArray[np.object_], rings: Rings, done: Repaired, source: str
+    polygons: NDArray[np.object_], rings: ClosedOutlines, done: Repaired, source: str
 ) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
     """Valid polygons, one or more an outline, and the outline that each came from."""
     origin = np.arange(len(polygons), dtype=np.int64)
@@ -255,7 +257,7 @@ def _reason_point(reason: str) -> tuple[float, float] | None:
 def _first_of_equals(
     polygons: NDArray[np.object_],
     layers: NDArray[np.object_],
-    rings: Rings,
+    rings: ClosedOutlines,
     origin: NDArray[np.int64],
     done: Repaired,
     source: str,
@@ -280,7 +282,7 @@ def _with_courtyards(
 ) -> tuple[NDArray[np.object_], NDArray[np.bool_]]:
     """Polygons with the rings inside them as holes, and which of the given ones became holes.
 
-    Rings are nested to any depth: a ring at odd depth is a courtyard, at even depth a building (in a courtyard).
+    ClosedOutlines are nested to any depth: a ring at odd depth is a courtyard, at even depth a building (in a courtyard).
     A ring that shares a stretch of wall with the one around it is not a courtyard.
     """
     outer, inner = shapely.STRtree(polygons).query(polygons)

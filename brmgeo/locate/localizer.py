@@ -37,7 +37,7 @@ def usual_reset_speed_m_s(settings: MatchSettings) -> float:
     return max(RESET_SPEED_M_S, settings.odometry.max_speed_m_s)
 
 
-class Step(NamedTuple):
+class LastStep(NamedTuple):
     """What a step was made of: the levelled view, the motion since the one before, and the matcher's seconds."""
 
     view: View
@@ -107,11 +107,11 @@ class Localizer:
         self._matcher = make_matcher(method, maps.ground, settings, history=history)
         self._motions = MotionSource(max_speed_m_s=reset_speed_m_s)
         self._t_s = -math.inf
-        self._last: Step | None = None
+        self._last: LastStep | None = None
         self._maps_known_by: dict[str, Any] | None = None
 
     @property
-    def last(self) -> Step | None:
+    def last(self) -> LastStep | None:
         """What the last step was made of; None before the first one and after loading."""
         return self._last
 
@@ -154,7 +154,7 @@ class Localizer:
         self._t_s = t_s
         start = time.perf_counter()
         estimate = self._matcher.step(view, motion)
-        self._last = Step(view, motion, time.perf_counter() - start)
+        self._last = LastStep(view, motion, time.perf_counter() - start)
         return estimate
 
     def view(

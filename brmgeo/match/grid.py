@@ -31,7 +31,7 @@ from brmgeo.match.track import Track, wrap
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-Frame = Literal["odometry", "map", "body"]
+YawFrame = Literal["odometry", "map", "body"]
 
 
 class GridMatcher:
@@ -63,7 +63,7 @@ class GridMatcher:
         self._off_frames = 0
         self._confirmed = False
         self._fits: deque[float] = deque(maxlen=scorer.least_fit[1])
-        self._frame: Frame = "odometry"
+        self._frame: YawFrame = "odometry"
         self._unfixed_searches = 0
         self._since_informed_m = 0.0
 
@@ -97,7 +97,7 @@ class GridMatcher:
         mode = self.belief.mode(self.settings.belief.mode_radius_m / self.cell_m)
         return self._estimate(view, motion, mode)
 
-    def _predict(self, motion: Motion, frame: Frame) -> None:
+    def _predict(self, motion: Motion, frame: YawFrame) -> None:
         odo = self.settings.odometry
         if motion.step_m is None:
             self.track, self._confirmed = None, False
@@ -364,7 +364,7 @@ class GridMatcher:
         """
         check_state(state, self.state())
         frame = str(state["frame"])
-        if frame not in get_args(Frame) or len(state["track.mean"]) != len(state["track.covariance"]):
+        if frame not in get_args(YawFrame) or len(state["track.mean"]) != len(state["track.covariance"]):
             raise damaged("its track or frame is not one")
         self.belief.restore(under(state, "belief"))
         self.scorer.restore(under(state, "scorer"))
@@ -375,12 +375,12 @@ class GridMatcher:
         self._started, self._confirmed = bool(state["started"]), bool(state["confirmed"])
         self._misses, self._off_frames = int(state["misses"]), int(state["off_frames"])
         self._fits.extend(state["fits"].tolist())
-        self._frame = cast(Frame, frame)
+        self._frame = cast(YawFrame, frame)
         self._unfixed_searches = int(state["unfixed_searches"])
         self._since_informed_m = float(state["since_informed_m"])
 
 
-def _frame(motion: Motion) -> Frame:
+def _frame(motion: Motion) -> YawFrame:
     """What the belief's heading is counted from: without odometry, the map's axes if a compass gives the body's yaw,
     else the body itself."""
     if motion.step_m is not None or motion.yaw_rad is not None:

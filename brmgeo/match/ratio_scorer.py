@@ -16,7 +16,7 @@ from brmgeo.match.belief import Belief
 from brmgeo.match.ground import DiscAreas, GroundMap, disc_pixels
 from brmgeo.match.kernels import BLOCK
 from brmgeo.match.rates import Rates
-from brmgeo.match.rings import Rings, cell_variance, ring_fit, ring_loglik, view_rings
+from brmgeo.match.rings import RingShares, cell_variance, ring_fit, ring_loglik, view_rings
 from brmgeo.match.search import search
 from brmgeo.match.settings import MatchSettings
 from brmgeo.match.smooth import Anchor
@@ -45,7 +45,7 @@ class RatioScorer:
         # Blocks that stand for the whole map where only few places are scored: the same ones in every frame.
         some = np.random.default_rng(0).permutation(len(self._every))[: self.SAMPLE]
         self._sample = self._every[np.sort(some)]
-        self._rings: Rings | None = None
+        self._rings: RingShares | None = None
         self._move = (0, np.empty(0))
 
     def look(self, view: View) -> None:

@@ -27,7 +27,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Rings:
+class RingShares:
     """Ring shares of a view: (n,) float64 ``share`` in [0, 1] and known area ``area_m2``, and the ``radius_m``
     of the discs."""
 
@@ -36,7 +36,7 @@ class Rings:
     radius_m: F64
 
 
-def view_rings(view: View, count: int) -> Rings:
+def view_rings(view: View, count: int) -> RingShares:
     """Shares of building in ``count`` rings between the radii r_k = k / count of the view's largest disc (eq. 1-3).
 
     A pixel belongs to a disc when its centre does; unknown pixels count in neither sum. A ring without known
@@ -54,7 +54,7 @@ def view_rings(view: View, count: int) -> Rings:
     ]
     share = np.divide(k, n, out=np.zeros(count), where=n > 0)
     radius = np.array(disc_radii(view.radius_m, count)[::-1])
-    return Rings(share, n * view.gsd_m**2, radius)
+    return RingShares(share, n * view.gsd_m**2, radius)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
@@ -91,7 +91,7 @@ def _ring_loglik(built, known, share, area, hit, alarm, unit, floor, move, dof, 
 
 
 def ring_loglik(
-    rings: Rings, built: F32, known: F32, rates: Rates, settings: RatioSettings, move: F64 | None = None
+    rings: RingShares, built: F32, known: F32, rates: Rates, settings: RatioSettings, move: F64 | None = None
 ) -> F32:
     """log p(rings | place), (...) float32, for maps of the ground in the discs of the rings' radii.
 
@@ -143,7 +143,7 @@ def cell_variance(built: F32, known: F32) -> F64:
     return total
 
 
-def ring_fit(rings: Rings, built: NDArray[np.floating], known: NDArray[np.floating]) -> float:
+def ring_fit(rings: RingShares, built: NDArray[np.floating], known: NDArray[np.floating]) -> float:
     """How far the building in a view's rings and in the map's agree, as Dice of areas, in [0, 1]; NaN for too little of it.
 
     Args:

@@ -1,6 +1,6 @@
 """The end of a training run: calibration, scores, the model card, and the files that are written.
 
-Scores are taken as prediction would answer: at the frames' own GSD, by the weights and looks that are kept.
+MaskScores are taken as prediction would answer: at the frames' own GSD, by the weights and looks that are kept.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch import Tensor
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.files import write_bytes
 from brmgeo.segment.augment import MEAN, STD
-from brmgeo.segment.ground import Ground, Picture
-from brmgeo.segment.metrics import LogitHistogram, Scores, best_threshold, segmentation_scores
+from brmgeo.segment.ground import ScoredFrame, TrainingGround
+from brmgeo.segment.metrics import LogitHistogram, MaskScores, best_threshold, segmentation_scores
 from brmgeo.segment.onnx_export import export_onnx
 from brmgeo.segment.predict import LOOKS, Segmenter
 from brmgeo.segment.recipe import Recipe
@@ -31,7 +31,7 @@ from brmgeo.segment.weights import ModelCard, save_weights
 def finish(
     state: Mapping[str, Tensor],
     recipe: Recipe,
-    ground: Ground,
+    ground: TrainingGround,
     out: Path,
     *,
     steps: int,
@@ -110,7 +110,7 @@ def finish(
     return {"calibration": calibration, "scores": scores}
 
 
-def _all_scores(segmenter: Segmenter, ground: Ground) -> dict[str, dict[str, float]]:
+def _all_scores(segmenter: Segmenter, ground: TrainingGround) -> dict[str, dict[str, float]]:
     """The scores of all ground that is not trained on; what cannot be told of one (features without room) is left out."""
     return {
         f"{split}: {name}{height}": {k: v for k, v in own.summary().items() if math.isfinite(v)}
@@ -120,7 +120,7 @@ def _all_scores(segmenter: Segmenter, ground: Ground) -> dict[str, dict[str, flo
     }
 
 
-def histograms(segmenter: Segmenter, validation: Mapping[str, Sequence[Picture]]) -> list[LogitHistogram]:
+def histograms(segmenter: Segmenter, validation: Mapping[str, Sequence[ScoredFrame]]) -> list[LogitHistogram]:
     """What a ``Segmenter`` says of each kind of validation ground."""
     parts = []
     for pictures in validation.values():
@@ -144,13 +144,13 @@ def weighed(parts: Sequence[LogitHistogram]) -> LogitHistogram:
     return whole
 
 
-def score(segmenter: Segmenter, pictures: Sequence[Picture]) -> dict[str, Scores]:
+def score(segmenter: Segmenter, pictures: Sequence[ScoredFrame]) -> dict[str, MaskScores]:
     """The scores of frames by a network, at the frames' own GSD.
 
     Under "" those of the answers as they are; where these can be laid onto the ground, under ", laid down from H m" those
     of what lies there, over the pixels whose roofs are within the frame.
     """
-    total = {"": Scores()}
+    total = {"": MaskScores()}
     for picture in pictures:
         image, label = picture.read()
         probability = segmenter.probability(image, picture.gsd_m)
@@ -161,7 +161,7 @@ def score(segmenter: Segmenter, pictures: Sequence[Picture]) -> dict[str, Scores
             answers[f", laid down from {picture.roof_m:g} m"] = laid, own
         for how, (seen, truth) in answers.items():
             found = segmentation_scores(seen, truth, segmenter.card.threshold, picture.gsd_m)
-            total[how] = total.get(how, Scores()) + found
+            total[how] = total.get(how, MaskScores()) + found
     return total
 
 

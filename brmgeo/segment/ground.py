@@ -116,7 +116,7 @@ def xyz_scenes(folder: Path, zoom: int, validation_share: float) -> tuple[list[S
         raise InputError(
             f"{folder}: no image is named ...X-Y-{zoom}: those are the tiles of zoom level {zoom}"
         )
-    # Ground metres: web-mercator's pixel shrinks with the cosine of the latitude.
+    # TrainingGround metres: web-mercator's pixel shrinks with the cosine of the latitude.
     y = sum(k[1] for k in tiles) / len(tiles)
     latitude = math.atan(math.sinh(math.pi * (1 - 2 * (y + 0.5) / 2**zoom)))
     shapes = sorted({label.shape for _, label in tiles.values()})
@@ -170,7 +170,7 @@ def _assembled(
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ScoredFrame:
     """One frame to be scored: how to read its (image, label), its GSD, and how roofs of ``roof_m`` are laid down in it."""
 
     read: Callable[[], tuple[U8, U8]]
@@ -180,7 +180,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class TrainingGround:
     """Everything that a recipe's sources hold.
 
     Attributes:
@@ -193,8 +193,8 @@ class Ground:
 
     train: Source
     crops: list[tuple[str, Source]]
-    validation: dict[str, list[Picture]]
-    test: dict[str, list[Picture]]
+    validation: dict[str, list[ScoredFrame]]
+    test: dict[str, list[ScoredFrame]]
     credits: list[dict[str, Any]]
     digest: str
 
@@ -204,7 +204,7 @@ def reduced(scene: Scene, finest_m: float) -> Scene:
     return Scene(*shrunk(scene.image, scene.label, k), scene.gsd_m * k, scene.name) if k > 1 else scene
 
 
-def frames_of(scene: Scene, gsd_m: float) -> list[Picture]:
+def frames_of(scene: Scene, gsd_m: float) -> list[ScoredFrame]:
     """The scene in frames of 512 px at about ``gsd_m``; those that are mostly unknown are left out."""
     side = math.ceil(_FRAME_PX * gsd_m / scene.gsd_m)
     h, w = scene.label.shape
@@ -218,11 +218,11 @@ def frames_of(scene: Scene, gsd_m: float) -> list[Picture]:
             def read(r: int = r, c: int = c) -> tuple[U8, U8]:
                 return scene.image[r : r + side, c : c + side], scene.label[r : r + side, c : c + side]
 
-            found.append(Picture(read, scene.gsd_m))
+            found.append(ScoredFrame(read, scene.gsd_m))
     return found
 
 
-def flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
+def flight_frames(folder: Path, roof_m: float = 0.0) -> list[ScoredFrame]:
     """The frames of a flight with its masks, onto which roofs of a height above 0 can be laid.
 
     Raises MissingInputError without frames or masks, SettingsError where the roofs reach a camera.
@@ -252,15 +252,15 @@ def flight_frames(folder: Path, roof_m: float = 0.0) -> list[Picture]:
         slant_gsd_m(flight.camera, flight.mount, frame.roll_rad, frame.pitch_rad, frame.agl_m)
         for frame in flight.frames
     ]
-    return [Picture(reader(i), gsd, layer(i) if roof_m else None, roof_m) for i, gsd in enumerate(gsds)]
+    return [ScoredFrame(reader(i), gsd, layer(i) if roof_m else None, roof_m) for i, gsd in enumerate(gsds)]
 
 
-def tile_frames(tiles: TileSet, chosen: Sequence[int], work_gsd_m: float) -> list[Picture]:
+def tile_frames(tiles: TileSet, chosen: Sequence[int], work_gsd_m: float) -> list[ScoredFrame]:
     """The tiles of the GSD nearest to ``work_gsd_m``, evenly thinned to what can be scored in a minute."""
     nearest = min({tiles.infos[i].gsd_m for i in chosen}, key=lambda g: abs(math.log(g / work_gsd_m)))
     own = [i for i in chosen if tiles.infos[i].gsd_m == nearest]
     own = [own[k] for k in np.linspace(0, len(own) - 1, min(_FRAMES_MOST, len(own))).astype(int)]
-    return [Picture(lambda i=i: tiles.read(i), nearest) for i in own]  # type: ignore[misc]
+    return [ScoredFrame(lambda i=i: tiles.read(i), nearest) for i in own]  # type: ignore[misc]
 
 
 # --- all of it ---------------------------------------------------------------------------------------------------
@@ -272,7 +272,7 @@ def gather(
     paths: Mapping[str, Path],
     scenes: Path,
     tile_sets: Callable[[SourceSpec], Iterable[tuple[str, TileSet]]],
-) -> Ground:
+) -> TrainingGround:
     """What ``sources`` of a recipe hold, read or made.
 
     Args:
@@ -319,7 +319,7 @@ class _Gathered:
     recipe: Recipe
     train: list[tuple[Source, float]] = field(default_factory=list)
     crops: list[tuple[str, Source]] = field(default_factory=list)
-    frames: dict[str, dict[str, list[Picture]]] = field(
+    frames: dict[str, dict[str, list[ScoredFrame]]] = field(
         default_factory=lambda: {"validation": {}, "test": {}}
     )
     credits: list[dict[str, Any]] = field(default_factory=list)
@@ -381,7 +381,7 @@ class _Gathered:
             if split != "test":
                 self.digest.update(tiles.digest(chosen))
 
-    def ground(self) -> Ground:
+    def ground(self) -> TrainingGround:
         if not self.train or not self.crops:
             raise SettingsError(
                 f"recipe {self.recipe.title!r}: names no ground to train on, or none to validate on"
@@ -394,4 +394,4 @@ class _Gathered:
                     )
         mixture = Mixture([s for s, _ in self.train], [w for _, w in self.train])
         validation, test = self.frames["validation"], self.frames["test"]
-        return Ground(mixture, self.crops, validation, test, self.credits, self.digest.hexdigest())
+        return TrainingGround(mixture, self.crops, validation, test, self.credits, self.digest.hexdigest())

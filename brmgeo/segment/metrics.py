@@ -26,7 +26,7 @@ RELIABILITY_BINS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class MaskScores:
     """Counts of one or more frames; ``a + b`` is the counts of both.
 
     Attributes:
@@ -49,8 +49,8 @@ class Scores:
     feature_error: float = 0.0
     frames: int = 0
 
-    def __add__(self, other: Scores) -> Scores:
-        return Scores(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+    def __add__(self, other: MaskScores) -> MaskScores:
+        return MaskScores(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     @property
     def accuracy(self) -> float:
@@ -98,7 +98,7 @@ def _share(part: float, whole: float) -> float:
 
 def segmentation_scores(
     probability: F32, label: U8, threshold: float, gsd_m: float, *, n: int = 3, tolerance_m: float = 1.0
-) -> Scores:
+) -> MaskScores:
     """The counts of one frame.
 
     Args:
@@ -125,7 +125,7 @@ def segmentation_scores(
     near = [_near(e, reach) for e in edges]
     f_estimate, f_truth = ring_features(estimate, known, n), ring_features(truth, known, n)
     measured = np.isfinite(f_truth)
-    return Scores(
+    return MaskScores(
         hit,
         false,
         missed,

@@ -32,7 +32,7 @@ from brmgeo.synth.scene import (
     Roof,
     TownStyle,
 )
-from brmgeo.synth.terrain import MILLIMETRE, Frame, Ground, Waves, polygons_of
+from brmgeo.synth.terrain import MILLIMETRE, LocalFrame, TownGround, Waves, polygons_of
 
 # Blue, red, green, grey, brown, orange, white: the painted metal and tile roofs of the Korean countryside.
 _ROOFS: tuple[tuple[Colour, ...], ...] = (
@@ -76,7 +76,7 @@ class Proposal:
 
 
 @dataclass
-class Plan:
+class TownPlan:
     """What the districts have proposed so far."""
 
     proposals: list[Proposal] = field(default_factory=list)
@@ -92,7 +92,7 @@ class Plan:
 def rectangle(x: float, y: float, w: float, d: float, angle: float) -> Polygon:
     """A rectangle about (x, y), ``w`` metres along ``angle`` and ``d`` across."""
     corners = np.array([[-w, -d], [w, -d], [w, d], [-w, d]]) / 2
-    return Polygon(Frame(x, y, angle).world(corners))
+    return Polygon(LocalFrame(x, y, angle).world(corners))
 
 
 def _jitter(rng: np.random.Generator, colour: Colour, sigma: float = 7.0) -> Colour:
@@ -152,7 +152,7 @@ def _house_shape(rng: np.random.Generator, x: float, y: float, w: float, d: floa
     corners = np.array(local) / 2
     if rng.random() < 0.5:
         corners[:, 0] *= -1
-    return Polygon(Frame(x, y, angle).world(corners))
+    return Polygon(LocalFrame(x, y, angle).world(corners))
 
 
 def _house(
@@ -171,7 +171,7 @@ def _house(
         roof, colour = "hip", _metal(rng, style)
     else:
         roof, colour = "gable", _metal(rng, style)
-    frame = Frame(x, y, angle)
+    frame = LocalFrame(x, y, angle)
     lot_w, lot_d = w + rng.uniform(3.5, 8), d + rng.uniform(6, 13)
     front = rng.uniform(0.15, 0.4) * (lot_d - d)
     lx, ly = frame.world(np.array([[rng.uniform(-1.5, 1.5), -front]]))[0]
@@ -203,7 +203,7 @@ def _house(
 
 
 def make_streets(
-    ground: Ground, zones: BaseGeometry, rng: np.random.Generator, style: TownStyle
+    ground: TownGround, zones: BaseGeometry, rng: np.random.Generator, style: TownStyle
 ) -> list[Road]:
     """The town's crooked grid of streets about its centre, outside ``zones`` and the river."""
     radius = ground.town_radius_m
@@ -241,7 +241,7 @@ def make_streets(
     return roads
 
 
-def town_blocks(ground: Ground, roads: list[Road], style: TownStyle) -> list[Polygon]:
+def town_blocks(ground: TownGround, roads: list[Road], style: TownStyle) -> list[Polygon]:
     """Blocks between the streets and through roads, road surface taken off."""
     lines = [r.line for r in roads]
     limit = ground.centre
@@ -258,7 +258,7 @@ def town_blocks(ground: Ground, roads: list[Road], style: TownStyle) -> list[Pol
 
 
 def fill_block(
-    block: Polygon, ground: Ground, rng: np.random.Generator, style: TownStyle, plan: Plan
+    block: Polygon, ground: TownGround, rng: np.random.Generator, style: TownStyle, plan: TownPlan
 ) -> None:
     """Shops along the through road, dense houses and row houses elsewhere, with some plots left empty."""
     distance = block.distance(ground.arterial)
@@ -298,7 +298,7 @@ def fill_block(
         depth += float(rng.uniform(15, 19))
 
 
-def _shop(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> float:
+def _shop(rng: np.random.Generator, p: Point, angle: float, plan: TownPlan) -> float:
     w, d = float(np.clip(rng.lognormal(2.6, 0.35), 8, 34)), float(rng.uniform(9, 15))
     floors = int(rng.choice([1, 2, 3, 4, 5], p=[0.22, 0.3, 0.26, 0.15, 0.07]))
     shape = _house_shape(rng, p.x, p.y, w, d, angle)
@@ -310,7 +310,7 @@ def _shop(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> float
         Proposal(Building(shape, OTHER, floors, 3.5 * floors + 1, roof, colour), 0.7, (ground,))
     )
     if rng.random() < 0.55:
-        back = Frame(p.x, p.y, angle).world(np.array([[rng.uniform(-3, 3), d / 2 + 4.5]]))[0]
+        back = LocalFrame(p.x, p.y, angle).world(np.array([[rng.uniform(-3, 3), d / 2 + 4.5]]))[0]
         shed = rectangle(
             float(back[0]), float(back[1]), float(rng.uniform(3, 9)), float(rng.uniform(2.5, 5)), angle
         )
@@ -318,14 +318,14 @@ def _shop(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> float
     return w + float(rng.choice([rng.uniform(1.5, 4), rng.uniform(6, 18)], p=[0.75, 0.25]))
 
 
-def _row_house(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> float:
+def _row_house(rng: np.random.Generator, p: Point, angle: float, plan: TownPlan) -> float:
     w, d = float(rng.uniform(15, 23)), float(rng.uniform(10, 13))
     floors = int(rng.choice([2, 3, 4, 5], p=[0.1, 0.35, 0.4, 0.15]))
     shape = _house_shape(rng, p.x, p.y, w, d, angle)
     lot = Area(rectangle(p.x, p.y, w + 3, d + 7, angle), "asphalt", angle, float(rng.normal()))
     building = Building(shape, ROW_HOUSE, floors, 2.9 * floors + 1.2, "flat", _pick(rng, _FLAT))
     plan.proposals.append(Proposal(building, 2.0, (lot,)))
-    side = Frame(p.x, p.y, angle).world(np.array([[rng.uniform(-6, 6), -d / 2 - 2.2]]))[0]
+    side = LocalFrame(p.x, p.y, angle).world(np.array([[rng.uniform(-6, 6), -d / 2 - 2.2]]))[0]
     for j in range(int(rng.integers(1, 3))):
         plan.cars.append(
             (
@@ -338,7 +338,13 @@ def _row_house(rng: np.random.Generator, p: Point, angle: float, plan: Plan) -> 
 
 
 def make_village(
-    x: float, y: float, ground: Ground, rng: np.random.Generator, style: TownStyle, plan: Plan, name: str
+    x: float,
+    y: float,
+    ground: TownGround,
+    rng: np.random.Generator,
+    style: TownStyle,
+    plan: TownPlan,
+    name: str,
 ) -> None:
     """Houses along a few crooked lanes, all facing about south, and a hall."""
     face = rng.normal(0, 0.3)
@@ -416,11 +422,11 @@ def make_village(
 
 def apartment_complex(
     zone: Polygon,
-    frame: Frame,
+    frame: LocalFrame,
     size: tuple[float, float],
     rng: np.random.Generator,
     style: TownStyle,
-    plan: Plan,
+    plan: TownPlan,
 ) -> None:
     """Parallel slabs that face south or so, car parks between them, a playground, walkway roofs, a small shop."""
     w, h = size
@@ -428,7 +434,7 @@ def apartment_complex(
     south -= round(south / (math.pi / 2)) * (math.pi / 2)
     slab_angle = south + rng.normal(0, 0.05)
     plan.grounds.append(Area(zone, "complex", slab_angle, float(rng.normal())))
-    local = Frame(frame.x, frame.y, slab_angle)
+    local = LocalFrame(frame.x, frame.y, slab_angle)
     tall = rng.random() < 0.55
     tone = _pick(rng, _FLAT[4:10] if tall else _FLAT, 4.0)
     reach = 0.5 * math.hypot(w, h)
@@ -467,7 +473,7 @@ def apartment_complex(
             for t in np.arange(-length / 2, length / 2, 5.5):
                 for off, chance in ((depth / 2 + 3.4, 0.75), (-depth / 2 - 2.6, 0.55)):
                     if rng.random() < chance:
-                        px, py = Frame(float(x), float(y), slab_angle).world(
+                        px, py = LocalFrame(float(x), float(y), slab_angle).world(
                             np.array([[t + rng.normal(0, 1), off + rng.normal(0, 0.5)]])
                         )[0]
                         plan.trees.append((float(px), float(py), float(rng.uniform(1.2, 2.6))))
@@ -514,12 +520,12 @@ def _slab(rng: np.random.Generator, x: float, y: float, length: float, depth: fl
     else:
         south += [[-length / 2, -depth / 2]]
     ring = [[-length / 2, depth / 2], *north, [length / 2, depth / 2], *south]
-    return Polygon(Frame(x, y, angle).world(np.array(ring)))
+    return Polygon(LocalFrame(x, y, angle).world(np.array(ring)))
 
 
-def _fill_parking(area: Area, angle: float, rng: np.random.Generator, plan: Plan, share: float) -> None:
+def _fill_parking(area: Area, angle: float, rng: np.random.Generator, plan: TownPlan, share: float) -> None:
     c = area.polygon.centroid
-    local = Frame(c.x, c.y, angle)
+    local = LocalFrame(c.x, c.y, angle)
     r = 0.5 * math.hypot(*(np.array(area.polygon.bounds[2:]) - np.array(area.polygon.bounds[:2])))
     inside = area.polygon.buffer(-2.0)
     for v in (-5.0, 5.0):
@@ -529,7 +535,7 @@ def _fill_parking(area: Area, angle: float, rng: np.random.Generator, plan: Plan
                 plan.cars.append((float(x), float(y), angle + math.pi / 2 + float(rng.normal(0, 0.02))))
 
 
-def _edge_trees(zone: Polygon, rng: np.random.Generator, plan: Plan, step: float, share: float) -> None:
+def _edge_trees(zone: Polygon, rng: np.random.Generator, plan: TownPlan, step: float, share: float) -> None:
     ring = zone.buffer(-2.6).exterior
     for s in np.arange(0, ring.length, step):
         if rng.random() < share:
@@ -544,7 +550,12 @@ def _edge_trees(zone: Polygon, rng: np.random.Generator, plan: Plan, step: float
 
 
 def school(
-    zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, plan: Plan, name: str
+    zone: Polygon,
+    frame: LocalFrame,
+    size: tuple[float, float],
+    rng: np.random.Generator,
+    plan: TownPlan,
+    name: str,
 ) -> None:
     """A school around a courtyard (a ring in a ring), a gym, a walkway roof and the sports ground."""
     w, h = size
@@ -585,7 +596,7 @@ def school(
 
 
 def works(
-    zone: Polygon, frame: Frame, size: tuple[float, float], rng: np.random.Generator, plan: Plan
+    zone: Polygon, frame: LocalFrame, size: tuple[float, float], rng: np.random.Generator, plan: TownPlan
 ) -> None:
     """Factories and warehouses on concrete, with offices, lean-to roofs and containers."""
     w, h = size
@@ -627,10 +638,10 @@ def works(
         plan.cars.append((float(x), float(y), frame.angle_rad + math.pi / 2))
 
 
-def petrol_station(x: float, y: float, angle: float, rng: np.random.Generator, plan: Plan) -> None:
+def petrol_station(x: float, y: float, angle: float, rng: np.random.Generator, plan: TownPlan) -> None:
     """A wide roof on posts over the pumps and a small shop behind."""
     plan.grounds.append(Area(rectangle(x, y, 36, 26, angle), "concrete", angle, 0.8))
-    frame = Frame(x, y, angle)
+    frame = LocalFrame(x, y, angle)
     roof = rectangle(x, y, float(rng.uniform(13, 19)), float(rng.uniform(8, 11)), angle)
     plan.proposals.append(Proposal(Building(roof, CANOPY, 1, 5.5, "canopy", _pick(rng, _PALE)), 1.0))
     sx, sy = frame.world(np.array([[2.0, 10.0]]))[0]
@@ -639,10 +650,10 @@ def petrol_station(x: float, y: float, angle: float, rng: np.random.Generator, p
     plan.cars.append((float(sx) - 9, float(sy) - 1, angle))
 
 
-def farmstead(x: float, y: float, angle: float, rng: np.random.Generator, plan: Plan) -> None:
+def farmstead(x: float, y: float, angle: float, rng: np.random.Generator, plan: TownPlan) -> None:
     """Long cattle sheds side by side, a feed silo hut and a dung shed."""
     count = int(rng.integers(2, 5))
-    frame = Frame(x, y, angle)
+    frame = LocalFrame(x, y, angle)
     depth = float(rng.uniform(11, 17))
     length = float(rng.uniform(32, 66))
     colour = _pick(rng, _SHED)
@@ -667,10 +678,10 @@ def farmstead(x: float, y: float, angle: float, rng: np.random.Generator, plan: 
         plan.proposals.append(Proposal(Building(hut, OTHER, 1, 3.2, "shed", _pick(rng, _SHED)), 0.6))
 
 
-def vinyl_houses(parcel: Area, rng: np.random.Generator, plan: Plan) -> None:
+def vinyl_houses(parcel: Area, rng: np.random.Generator, plan: TownPlan) -> None:
     """Greenhouses side by side along a parcel's long direction."""
     c = parcel.polygon.centroid
-    frame = Frame(c.x, c.y, parcel.angle_rad)
+    frame = LocalFrame(c.x, c.y, parcel.angle_rad)
     rect = np.asarray(affinity.rotate(parcel.polygon, -parcel.angle_rad, origin=c, use_radians=True).bounds)
     u0, v0, u1, v1 = rect - np.array([c.x, c.y, c.x, c.y])
     wide = float(rng.uniform(6.2, 8.2))

@@ -16,11 +16,11 @@ from brmgeo.flight.readings import Camera, FloatArray
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.raster import read_raster
 from brmgeo.pictures import decode, encode
-from brmgeo.region import FlightSettings as RegionFlight
+from brmgeo.region import FlightSettings
 from brmgeo.synth.flight import (
-    FlightSettings,
-    Ground,
     Imagery,
+    RaisedFootprints,
+    SimulationSettings,
     lawnmower,
     path_from_geojson,
     place,
@@ -45,25 +45,25 @@ class FineImagery(Protocol):
 
 
 @functools.lru_cache(maxsize=2)
-def read_ground(footprints: Path) -> Ground:
+def read_ground(footprints: Path) -> RaisedFootprints:
     """Footprints made ready for the simulator, with heights from their floors (3 m each) where they are known."""
     import geopandas as gpd
 
     frame = gpd.read_file(footprints, layer="footprints" if footprints.suffix == ".gpkg" else None)
     floors = frame["floors"].fillna(1).to_numpy(dtype=float) if "floors" in frame else np.ones(len(frame))
-    return Ground.from_polygons(list(frame.geometry), list(_FLOOR_M * floors))
+    return RaisedFootprints.from_polygons(list(frame.geometry), list(_FLOOR_M * floors))
 
 
-def simulator_settings(own: RegionFlight, **changes: Any) -> FlightSettings:
+def simulator_settings(own: FlightSettings, **changes: Any) -> SimulationSettings:
     """The simulator's settings of a region: camera, height, speed and interval as its file says, then ``changes``."""
     camera = Camera.from_fov(own.width_px, own.height_px, own.fov_deg)
-    base = FlightSettings(
+    base = SimulationSettings(
         camera=camera, speed_m_s=own.speed_m_s, frame_interval_s=own.interval_s, agl_m=own.agl_m
     )
     return replace(base, **changes)
 
 
-def flight_path(path: str, ground: Ground, seed: int, bounds: Bounds, crs: str) -> FloatArray:
+def flight_path(path: str, ground: RaisedFootprints, seed: int, bounds: Bounds, crs: str) -> FloatArray:
     """(n, 2) waypoints in ``crs``: one of ``PATHS`` placed over built-up ground by the seed, or the line of a GeoJSON file.
 
     Raises MissingInputError for what is neither, InputError for a shape that does not fit into the bounds or a file that
@@ -95,7 +95,7 @@ def inset(bounds: Bounds, by: float) -> Bounds:
 
 
 def imagery_along(
-    route: FloatArray, settings: FlightSettings, file: Path, fine: FineImagery | None = None
+    route: FloatArray, settings: SimulationSettings, file: Path, fine: FineImagery | None = None
 ) -> Imagery:
     """What frames along a (n, 2) route are drawn from: the finer imagery where there is some, else the whole of a raster.
 
@@ -109,7 +109,7 @@ def imagery_along(
     return Imagery(np.moveaxis(picture.pixels, 0, -1), picture.left, picture.top, picture.gsd_m)
 
 
-def _seen_deg(settings: FlightSettings) -> float:
+def _seen_deg(settings: SimulationSettings) -> float:
     """The cone about straight down, degrees, that a simulated camera sees across its short side, tilt counted in."""
     camera, mount = settings.camera, settings.mount
     fov = 2 * math.degrees(math.atan(camera.half_fov_tan))

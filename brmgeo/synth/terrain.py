@@ -39,7 +39,7 @@ class Waves:
 
 
 @dataclass(frozen=True)
-class Frame:
+class LocalFrame:
     """A local frame: ``u`` along a direction, ``v`` to the left of it, about an origin."""
 
     x: float
@@ -56,7 +56,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Ground:
+class TownGround:
     """What the districts are laid out on."""
 
     domain: Polygon
@@ -66,7 +66,7 @@ class Ground:
     arterial: LineString
     cross: LineString
     levees: list[LineString]
-    centre: Frame
+    centre: LocalFrame
     town_radius_m: float
     hills: Waves
     forest_level: float
@@ -86,7 +86,7 @@ def polygons_of(geometry: BaseGeometry, min_area_m2: float = 0.0) -> list[Polygo
 
 
 def _hillness(
-    xy: NDArray[np.float64], hills: Waves, river: LineString, centre: Frame, radius: float
+    xy: NDArray[np.float64], hills: Waves, river: LineString, centre: LocalFrame, radius: float
 ) -> NDArray[np.float64]:
     distance = shapely.distance(shapely.points(xy), river)
     rise = np.clip((distance - 260.0) / 800.0, 0.0, 1.2)
@@ -94,13 +94,13 @@ def _hillness(
     return np.asarray(hills(xy) + 1.5 * rise - 3.2 * np.exp(-0.5 * (town / 1.05) ** 2), dtype=np.float64)
 
 
-def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyle) -> Ground:
+def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyle) -> TownGround:
     """Relief, river, through roads and woods over ``domain_bounds``."""
     left, bottom, right, top = domain_bounds
     width, height = right - left, top - bottom
     size = min(width, height)
     scale = min(1.0, size / 2200.0)
-    middle = Frame(
+    middle = LocalFrame(
         (left + right) / 2 + rng.uniform(-0.06, 0.06) * width,
         (bottom + top) / 2 + rng.uniform(-0.06, 0.06) * height,
         math.radians(rng.uniform(50, 130)),
@@ -133,7 +133,7 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
     x0, y0 = middle.world(np.array([[t[i0], smooth[i0]]]))[0]
     radius = min(560.0, 0.27 * size)
     # Local v points away from the river whichever side the town is on; the frame is mirrored by its user.
-    centre = Frame(float(x0), float(y0), middle.angle_rad + slope)
+    centre = LocalFrame(float(x0), float(y0), middle.angle_rad + slope)
 
     v = np.arange(-reach, reach + 1, 20.0)
     turn = rng.uniform(-0.15, 0.15)
@@ -149,7 +149,7 @@ def make_ground(domain_bounds: Bounds, rng: np.random.Generator, style: TownStyl
     relief = _relief(domain_bounds, rng, scale, river, centre, radius)
     level = float(np.quantile(relief.hill, 1.0 - style.forest_share))
     keep_out = shapely.union_all([bank.buffer(12.0), arterial.buffer(20.0), cross.buffer(10.0)])
-    return Ground(
+    return TownGround(
         domain=domain,
         water=polygons_of(water.intersection(domain)),
         bank=bank,
@@ -178,7 +178,12 @@ class _Relief:
 
 
 def _relief(
-    bounds: Bounds, rng: np.random.Generator, scale: float, river: LineString, centre: Frame, radius: float
+    bounds: Bounds,
+    rng: np.random.Generator,
+    scale: float,
+    river: LineString,
+    centre: LocalFrame,
+    radius: float,
 ) -> _Relief:
     left, bottom, right, top = bounds
     hills = Waves(rng, (max(380.0 * scale, 120.0), max(1500.0 * scale, 400.0)), 28)
@@ -224,7 +229,7 @@ def _contours(relief: _Relief, level: float, domain: Polygon) -> list[tuple[Line
 
 
 def _ribbon(
-    frame: Frame, t: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+    frame: LocalFrame, t: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
 ) -> BaseGeometry:
     ring = np.concatenate([np.column_stack([t, lower]), np.column_stack([t, upper])[::-1]])
     return shapely.make_valid(Polygon(frame.world(ring)))
@@ -251,7 +256,7 @@ CROPS = {
 
 
 def make_fields(
-    ground: Ground, taken: BaseGeometry, rng: np.random.Generator, style: TownStyle
+    ground: TownGround, taken: BaseGeometry, rng: np.random.Generator, style: TownStyle
 ) -> tuple[list[Area], list[Road]]:
     """Parcels over the free ground outside ``taken``, and the farm tracks between them.
 
@@ -275,7 +280,7 @@ def make_fields(
         along = ground.river.project(shapely.Point(middle[0]))
         a, b = ground.river.interpolate(along - 20), ground.river.interpolate(along + 20)
         angle = math.atan2(b.y - a.y, b.x - a.x) + rng.normal(0, 0.9 if uphill else 0.22)
-        frame = Frame(cell.centroid.x, cell.centroid.y, angle)
+        frame = LocalFrame(cell.centroid.x, cell.centroid.y, angle)
         free = shapely.difference(cell, taken)
         if free.area < 300.0:
             continue
@@ -300,7 +305,7 @@ def make_fields(
     return fields, tracks
 
 
-def _strips(cell: Polygon, frame: Frame, rng: np.random.Generator, tracks: list[Road]) -> list[Polygon]:
+def _strips(cell: Polygon, frame: LocalFrame, rng: np.random.Generator, tracks: list[Road]) -> list[Polygon]:
     reach = 0.75 * math.sqrt(cell.area) + 160.0
     pieces: list[Polygon] = []
     v = -reach

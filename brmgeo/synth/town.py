@@ -19,9 +19,9 @@ from shapely.geometry.base import BaseGeometry
 from brmgeo.errors import SettingsError
 from brmgeo.geo.grid import Bounds
 from brmgeo.synth import districts
-from brmgeo.synth.districts import Plan
+from brmgeo.synth.districts import TownPlan
 from brmgeo.synth.scene import TEMPORARY, Area, Building, Road, Town, TownStyle
-from brmgeo.synth.terrain import MILLIMETRE, Frame, Ground, make_fields, make_ground, polygons_of
+from brmgeo.synth.terrain import MILLIMETRE, LocalFrame, TownGround, make_fields, make_ground, polygons_of
 
 MARGIN_M = 140.0
 _VILLAGES = (
@@ -53,7 +53,7 @@ def generate_town(bounds: Bounds, seed: int, style: TownStyle | None = None, crs
     rng = np.random.default_rng([seed, 0xB0])
     domain_bounds = (left - MARGIN_M, bottom - MARGIN_M, right + MARGIN_M, top + MARGIN_M)
     ground = make_ground(domain_bounds, rng, style)
-    plan = Plan()
+    plan = TownPlan()
     wide = style.road_scale
     plan.roads = [Road(ground.arterial, 15.5 * wide, "arterial"), Road(ground.cross, 9.5 * wide, "main")]
     plan.roads += [Road(line, 4.4, "lane") for line in ground.levees]
@@ -118,7 +118,7 @@ def generate_town(bounds: Bounds, seed: int, style: TownStyle | None = None, crs
 
 
 def _make_zones(
-    ground: Ground, woods: BaseGeometry, rng: np.random.Generator, style: TownStyle, plan: Plan
+    ground: TownGround, woods: BaseGeometry, rng: np.random.Generator, style: TownStyle, plan: TownPlan
 ) -> list[Polygon]:
     """Apartment complexes, school and works: large plots at the town's edge, placed where they fit."""
     scale = min(1.0, ground.town_radius_m / 560.0)
@@ -145,7 +145,7 @@ def _make_zones(
             a, b = line.interpolate(s - 15), line.interpolate(s + 15)
             angle = math.atan2(b.y - a.y, b.x - a.x) + float(rng.normal(0, 0.1))
             angle -= round(angle / (math.pi / 2)) * (math.pi / 2)
-            frame = Frame(float(x), float(y), angle)
+            frame = LocalFrame(float(x), float(y), angle)
             zone = districts.rectangle(float(x), float(y), w, h, angle)
             zone = Polygon(np.asarray(zone.exterior.coords)[:4] + rng.normal(0, 4.0, (4, 2)))
             padded = zone.buffer(9.0)
@@ -166,12 +166,12 @@ def _make_zones(
 
 
 def _countryside(
-    ground: Ground,
+    ground: TownGround,
     woods: BaseGeometry,
     built_up: BaseGeometry,
     rng: np.random.Generator,
     style: TownStyle,
-    plan: Plan,
+    plan: TownPlan,
 ) -> None:
     """Villages at the foot of the hills, farms, small works and petrol stations along the roads."""
     left, bottom, right, top = ground.domain.bounds
@@ -236,7 +236,7 @@ def _countryside(
         plan.proposals.append(districts.Proposal(Building(hut, TEMPORARY, 1, 2.6, "box", colour), 1.0))
 
 
-def _vinyl(fields: list[Area], rng: np.random.Generator, style: TownStyle, plan: Plan) -> list[Area]:
+def _vinyl(fields: list[Area], rng: np.random.Generator, style: TownStyle, plan: TownPlan) -> list[Area]:
     """Turns some parcels, in clusters, into ground under vinyl houses."""
     if not fields or style.greenhouse_share <= 0:
         return fields
@@ -284,14 +284,14 @@ def _off_buildings(fields: list[Area], yards: BaseGeometry) -> list[Area]:
 
 
 def _field_trees(
-    fields: list[Area], ground: Ground, plan: Plan, rng: np.random.Generator
+    fields: list[Area], ground: TownGround, plan: TownPlan, rng: np.random.Generator
 ) -> list[tuple[float, float, float]]:
     """Orchard rows, lone trees on field borders and river banks, the ragged edge of the woods, street trees."""
     trees: list[tuple[float, float, float]] = []
     for f in fields:
         if f.kind == "orchard":
             c = f.polygon.centroid
-            frame = Frame(c.x, c.y, f.angle_rad)
+            frame = LocalFrame(c.x, c.y, f.angle_rad)
             step_u, step_v = rng.uniform(3.4, 5.0), rng.uniform(4.4, 6.0)
             r = 0.5 * math.hypot(
                 f.polygon.bounds[2] - f.polygon.bounds[0], f.polygon.bounds[3] - f.polygon.bounds[1]
@@ -359,7 +359,7 @@ def _clear(
     return [t for t, g in zip(trees, good.tolist()) if g]
 
 
-def _road_cars(plan: Plan, rng: np.random.Generator) -> list[tuple[float, float, float]]:
+def _road_cars(plan: TownPlan, rng: np.random.Generator) -> list[tuple[float, float, float]]:
     cars = list(plan.cars)
     spacing = {"arterial": 55.0, "main": 80.0, "street": 42.0, "lane": 110.0}
     for road in plan.roads:

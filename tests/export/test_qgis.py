@@ -19,7 +19,7 @@ from brmgeo.errors import CrsError, InputError
 from brmgeo.export import qgis_style
 from brmgeo.export.candidates import write_candidates
 from brmgeo.export.qgis import style_footprints, write_flight_project, write_maps_project
-from brmgeo.export.trajectory import Track, write_trajectory
+from brmgeo.export.trajectory import TimedPath, write_trajectory
 
 CHECK = Path(__file__).parents[1] / "qgis" / "check_qgis.py"
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -57,9 +57,9 @@ def flight_project(region: Region, limit: int = 100_000, name: str = "mask") -> 
         start_utc=START,
         geojson_limit=limit,
     )
-    track = Track(t_s, xy + 1.0, np.full(12, 0.7), np.full(12, 2.0))
+    track = TimedPath(t_s, xy + 1.0, np.full(12, 0.7), np.full(12, 2.0))
     write_trajectory(
-        folder, estimates, ["f"] * 12, CRS, start_utc=START, smoothed=track, reference=Track(t_s, xy)
+        folder, estimates, ["f"] * 12, CRS, start_utc=START, smoothed=track, reference=TimedPath(t_s, xy)
     )
     return write_flight_project(
         folder / "flight.qgz",

@@ -15,14 +15,14 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 from small_region import CRS, estimate, flight
 
-from brmgeo.export.trajectory import Track, write_fixes, write_trajectory, write_tum
+from brmgeo.export.trajectory import TimedPath, write_fixes, write_trajectory, write_tum
 
 
-def paths() -> tuple[Track, Track]:
+def paths() -> tuple[TimedPath, TimedPath]:
     t = np.arange(12) * 5.0
     xy = np.array([e.mean for e in flight()])
-    smoothed = Track(t, xy + 0.5, np.full(12, 0.7), np.full(12, 1.5), np.full(12, 150.0))
-    return smoothed, Track(t[:8], xy[:8])
+    smoothed = TimedPath(t, xy + 0.5, np.full(12, 0.7), np.full(12, 1.5), np.full(12, 150.0))
+    return smoothed, TimedPath(t[:8], xy[:8])
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -73,7 +73,7 @@ def test_heading_is_clockwise_from_north_whatever_the_yaw(
 
 def test_tum_turns_the_body_s_nose_into_the_map(tmp_path: Path) -> None:
     yaw = np.array([0.0, 1.2, -3.0, np.nan])
-    track = Track(
+    track = TimedPath(
         np.arange(4) * 0.1,
         np.array([[352_000.12345, 565_000.0]] * 4),
         yaw,
@@ -169,9 +169,9 @@ def test_lengths_that_differ_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="file names"):
         write_trajectory(tmp_path, flight(), ["a"], CRS)
     with pytest.raises(ValueError, match="a track of 2"):
-        Track(np.zeros(2), np.zeros((2, 2)), np.zeros(3))
+        TimedPath(np.zeros(2), np.zeros((2, 2)), np.zeros(3))
     with pytest.raises(ValueError, match="decrease"):
-        Track(np.array([1.0, 0.0]), np.zeros((2, 2)))
+        TimedPath(np.array([1.0, 0.0]), np.zeros((2, 2)))
 
 
 def test_no_line_is_drawn_across_a_gap_of_the_smoothed_path(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu
 from brmgeo.flight.vio import Vio, VioResult, VioSettings, VioStep, run_vio
 from brmgeo.flight.vio.kernels import SIZE, exp, ground_layer, propagate, tie
 from brmgeo.flight.vio.live import IDLE_S, PATIENCE_S, READ_ON_S
-from brmgeo.synth.flight import Course, FlightSettings, Ground, Imagery, Simulator, fly, imu_of
+from brmgeo.synth.flight import Course, Imagery, RaisedFootprints, SimulationSettings, Simulator, fly, imu_of
 
 CAMERA = Camera.from_fov(320, 240, 43.0)
 MOUNT = Attitude(0.02, -0.15, 0.0)
@@ -141,7 +141,7 @@ def _draw(course: Course, rows: NDArray[np.int64], texture: NDArray[np.uint8]) -
 
 def _flown(seed: int = 2, **changes: object) -> tuple[Course, Imu]:
     settings = replace(
-        FlightSettings(camera=CAMERA, mount=MOUNT, frame_interval_s=0.2, agl_m=100.0, turn_radius_m=15.0),
+        SimulationSettings(camera=CAMERA, mount=MOUNT, frame_interval_s=0.2, agl_m=100.0, turn_radius_m=15.0),
         **changes,  # type: ignore[arg-type]
     )
     course = fly(np.array([[-60.0, -40.0], [40.0, -40.0], [40.0, 40.0]]), settings, seed)
@@ -231,12 +231,12 @@ def test_steps_over_buildings_err_as_much_as_is_said_of_them(heights_m: tuple[fl
     boxes = [shapely.box(x, y, x + 14.0, y + 11.0) for x, y in rng.uniform(-160, 160, (260, 2))]
     apart = shapely.STRtree(boxes)
     boxes = [b for i, b in enumerate(boxes) if apart.query(b, predicate="intersects").min() == i]
-    ground = Ground.from_polygons(boxes, list(rng.choice(heights_m, len(boxes))))
+    ground = RaisedFootprints.from_polygons(boxes, list(rng.choice(heights_m, len(boxes))))
     imagery = Imagery(np.repeat(_texture()[:, :, None], 3, axis=2), -180.0, 180.0, 0.4)
     squared = []
     for seed in (1, 2, 3):
         course, imu = _flown(seed)
-        settings = FlightSettings(camera=CAMERA, mount=MOUNT, agl_m=100.0)
+        settings = SimulationSettings(camera=CAMERA, mount=MOUNT, agl_m=100.0)
         simulator = Simulator(ground, settings, course, seed)
         frames = (
             cv2.cvtColor(simulator.picture(i, imagery), cv2.COLOR_RGB2GRAY).astype(np.uint8)

@@ -17,8 +17,8 @@ from brmgeo.flight.readings import Attitude
 from brmgeo.flight.view import make_view
 from brmgeo.locate import masks as locating
 from brmgeo.segment.predict import Answer, Segmenter
-from brmgeo.synth.flight import FlightSettings as Simulated
-from brmgeo.synth.flight import Ground, Simulator, fly
+from brmgeo.synth.flight import RaisedFootprints, Simulator, fly
+from brmgeo.synth.flight import SimulationSettings as Simulated
 from brmgeo.workflow.progress import Progress
 
 
@@ -112,7 +112,7 @@ def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
         shapely.box(x, y, x + w, y + h)
         for (x, y), (w, h) in zip(at, rng.uniform(6, 16, (64, 2)), strict=True)
     ]
-    ground = Ground.from_polygons(boxes, [6.0] * len(boxes))
+    ground = RaisedFootprints.from_polygons(boxes, [6.0] * len(boxes))
     own = Simulated(mount=Attitude(pitch_rad=math.radians(-15)), agl_m=100.0, agl_sigma_m=0.0).exact()
     path = np.array([[60.0, 100.0], [120.0, 100.0]])
     simulator = Simulator(ground, own, fly(path, own, 1), 1)

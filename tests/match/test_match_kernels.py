@@ -30,7 +30,7 @@ from brmgeo.match.kernels import BLOCK
 from brmgeo.match.mask import MapCover, MaskTiers, mask_templates, view_points
 from brmgeo.match.rates import RateLearner, Rates
 from brmgeo.match.register import Registrar
-from brmgeo.match.rings import Rings, ring_loglik, view_rings
+from brmgeo.match.rings import RingShares, ring_loglik, view_rings
 from brmgeo.match.search import search, search_tiers
 from brmgeo.match.smooth import Anchor, smooth_path, solve_tridiagonal
 from brmgeo.match.track import Track
@@ -348,7 +348,9 @@ def test_disc_areas_equal_counting(cell_px: int) -> None:
 
 
 def test_ring_density_is_the_student_density() -> None:
-    rings = Rings(np.array([0.3, 0.1, 0.6]), np.array([400.0, 1200.0, 0.0]), np.array([10.0, 20.0, 30.0]))
+    rings = RingShares(
+        np.array([0.3, 0.1, 0.6]), np.array([400.0, 1200.0, 0.0]), np.array([10.0, 20.0, 30.0])
+    )
     built = np.array([[[100.0, 0.0]], [[300.0, 100.0]], [[300.0, 900.0]]], np.float32)
     known = np.array([[[400.0, 400.0]], [[1600.0, 700.0]], [[2800.0, 2800.0]]], np.float32)
     settings = RatioSettings()

@@ -15,7 +15,7 @@ from pyproj import Transformer
 
 from brmgeo.errors import BrmgeoError, CrsError, MissingInputError, SettingsError
 from brmgeo.export.candidates import write_candidates
-from brmgeo.export.trajectory import Track, write_trajectory
+from brmgeo.export.trajectory import TimedPath, write_trajectory
 from brmgeo.flight.values import Estimate
 from pipelines.cli import cli, run
 from pipelines.results import export_results
@@ -32,7 +32,7 @@ def results(tmp_path: Path) -> Path:
         Estimate(5.0 * i, "converged" if i > 1 else "ambiguous", xy, np.eye(2), 0.5, 0.1, 1.0, xy[None], np.ones(1), 1)
         for i, xy in enumerate(XY)
     ]  # fmt: skip
-    smoothed = Track(np.arange(6) * 5.0, XY + 0.5, np.full(6, np.nan), np.full(6, 1.5))
+    smoothed = TimedPath(np.arange(6) * 5.0, XY + 0.5, np.full(6, np.nan), np.full(6, 1.5))
     write_trajectory(out, estimates, [f"{i}.jpg" for i in range(6)], CRS, smoothed=smoothed)
     write_candidates(out, [(e.t_s, e.candidates, e.candidate_mass, e.status) for e in estimates], CRS)
     return out

@@ -12,7 +12,7 @@ import torch
 
 from brmgeo.segment import finish as ending
 from brmgeo.segment.finish import licence_of, score
-from brmgeo.segment.ground import Picture
+from brmgeo.segment.ground import ScoredFrame
 from brmgeo.segment.metrics import LogitHistogram
 from brmgeo.segment.predict import Segmenter
 from brmgeo.segment.recipe import Recipe
@@ -41,7 +41,7 @@ def test_answers_are_scored_as_they_are_and_laid_down() -> None:
         down[:4] = np.nan
         return down
 
-    picture = Picture(lambda: (np.zeros((60, 80, 3), np.uint8), label), 0.2, laid, 2.0)
+    picture = ScoredFrame(lambda: (np.zeros((60, 80, 3), np.uint8), label), 0.2, laid, 2.0)
     segmenter: Any = types.SimpleNamespace(
         probability=lambda image, gsd_m: seen, card=types.SimpleNamespace(threshold=0.5)
     )
@@ -116,7 +116,7 @@ def test_a_run_that_ends_while_it_finishes_leaves_the_weights_of_before(
     rng = np.random.default_rng(7)
     image = rng.integers(0, 255, (64, 64, 3)).astype(np.uint8)
     label = np.where(image[..., 0] > 128, 255, 0).astype(np.uint8)
-    frames = {"held": [Picture(lambda: (image, label), 0.25)]}
+    frames = {"held": [ScoredFrame(lambda: (image, label), 0.25)]}
     ground: Any = types.SimpleNamespace(validation=frames, test={}, credits=[])
 
     def run(seed: int) -> None:

@@ -10,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brmgeo.maps.ratio import disc_counts
-from brmgeo.segment.metrics import LogitHistogram, Scores, best_threshold, ring_features, segmentation_scores
+from brmgeo.segment.metrics import (
+    LogitHistogram,
+    MaskScores,
+    best_threshold,
+    ring_features,
+    segmentation_scores,
+)
 
 
 def random_frame(seed: int, shape: tuple[int, int] = (37, 52)) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +95,7 @@ def test_counts_add_up() -> None:
     top, bottom = (np.concatenate([random_frame(1)[k], random_frame(2)[k]]) for k in (0, 1))
     assert both.hit == segmentation_scores(top, bottom, 0.5, 0.5).hit
     assert both.frames == 2
-    assert sum(parts, Scores()) == both
+    assert sum(parts, MaskScores()) == both
 
 
 def test_a_perfect_mask_scores_one_and_a_moved_one_knows_its_distance() -> None:

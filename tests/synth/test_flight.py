@@ -21,11 +21,11 @@ from brmgeo.flight.values import View
 from brmgeo.geo.crs import transformer
 from brmgeo.synth.flight import (
     RATE_HZ,
-    FlightSettings,
-    Ground,
     Imagery,
     MaskErrors,
     OdometryErrors,
+    RaisedFootprints,
+    SimulationSettings,
     Simulator,
     fly,
     frame_name,
@@ -44,7 +44,7 @@ CRS = "EPSG:5187"
 LEFT, BOTTOM, SIZE = 229000.0, 379000.0, 900.0
 BOUNDS = (LEFT, BOTTOM, LEFT + SIZE, BOTTOM + SIZE)
 PATH = np.array([[200.0, 300.0], [500.0, 300.0], [500.0, 600.0]]) + [LEFT, BOTTOM]
-SHORT = FlightSettings(frame_interval_s=15.0)
+SHORT = SimulationSettings(frame_interval_s=15.0)
 
 
 def polygons() -> list[shapely.Polygon]:
@@ -62,7 +62,7 @@ def polygons() -> list[shapely.Polygon]:
 
 
 POLYGONS = polygons()
-GROUND = Ground.from_polygons(POLYGONS, [3.0 * (1 + i % 7) for i in range(len(POLYGONS))])
+GROUND = RaisedFootprints.from_polygons(POLYGONS, [3.0 * (1 + i % 7) for i in range(len(POLYGONS))])
 
 
 def overlap(view: View, xy: np.ndarray, yaw: float) -> float:
@@ -92,7 +92,7 @@ def overlap(view: View, xy: np.ndarray, yaw: float) -> float:
     ],
     ids=["nadir", "tilted and distorted"],
 )
-def test_true_poses_lay_views_onto_the_map(settings: FlightSettings) -> None:
+def test_true_poses_lay_views_onto_the_map(settings: SimulationSettings) -> None:
     flight = simulate_views(GROUND, PATH, settings.exact(), seed=1)
     assert len(flight.views) == 8
     for view, xy, yaw in zip(flight.views, flight.reference.xy_m, flight.yaw_rad):
@@ -212,7 +212,7 @@ def test_pictures_show_the_imagery_where_the_geometry_says() -> None:
     plane = np.stack([x / 1800 * 255, y / 1800 * 255, np.full_like(x, 90)], -1).astype(np.uint8)
     imagery = Imagery(plane, LEFT, BOTTOM + SIZE, 0.5)
     course = fly(PATH, settings, 4)
-    flat = Ground.from_polygons(POLYGONS)
+    flat = RaisedFootprints.from_polygons(POLYGONS)
     image = Simulator(flat, settings, course, 4).picture(2, imagery).astype(float)
     row = course.frame_index[2]
     rotation = world_from_camera(settings.mount, *course.roll_pitch_yaw[row])
@@ -229,10 +229,10 @@ def test_roofs_lean_outwards_by_their_height() -> None:
         [[LEFT + 200, BOTTOM + 340], [LEFT + 600, BOTTOM + 340]]
     )  # eastwards, the tower to the right
     settings = replace(
-        FlightSettings(), wobble_deg=0.0, cruise_pitch_deg=0.0, crab_sigma_deg=0.0, agl_sigma_m=0.0
+        SimulationSettings(), wobble_deg=0.0, cruise_pitch_deg=0.0, crab_sigma_deg=0.0, agl_sigma_m=0.0
     ).exact()
     course = fly(path, settings, 1)
-    simulator = Simulator(Ground.from_polygons(tower, [30.0]), settings, course, 1)
+    simulator = Simulator(RaisedFootprints.from_polygons(tower, [30.0]), settings, course, 1)
     frame = 6  # 150 m on, beside the tower
     low, high = simulator.mask(frame), simulator.mask(frame, relief=True)
     middle = [np.argwhere(m == 255)[:, 1].mean() - 319.5 for m in (low, high)]
@@ -290,7 +290,7 @@ def test_buildings_can_be_missed_in_every_frame() -> None:
 
 
 def test_odometry_errors() -> None:
-    course = fly(rectangle((LEFT + 450, BOTTOM + 450), 20.0), FlightSettings(), 3)
+    course = fly(rectangle((LEFT + 450, BOTTOM + 450), 20.0), SimulationSettings(), 3)
     truth = course.xyz_m[:, :2]
     exact = odometry_of(course, OdometryErrors.none(), 3)
     at = np.round(exact.t_s * RATE_HZ).astype(int)
@@ -314,7 +314,7 @@ def test_odometry_errors() -> None:
 
 
 def test_an_odometry_reset_shows_as_a_step_unknown() -> None:
-    settings = replace(FlightSettings(), odometry=OdometryErrors(reset_times_s=(52.0,)))
+    settings = replace(SimulationSettings(), odometry=OdometryErrors(reset_times_s=(52.0,)))
     steps = simulate_views(GROUND, PATH, settings, 2).motions
     assert [i for i, m in enumerate(steps) if m.step_m is None] == [0, 11]
     without = simulate_views(GROUND, PATH, replace(settings, odometry=None), 2).motions
@@ -322,7 +322,7 @@ def test_an_odometry_reset_shows_as_a_step_unknown() -> None:
 
 
 def test_imu_readings_integrate_to_the_course() -> None:
-    course = fly(PATH, FlightSettings(), 3)
+    course = fly(PATH, SimulationSettings(), 3)
     imu = imu_of(course, 3)
     gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
     n = 10 * RATE_HZ
@@ -332,7 +332,7 @@ def test_imu_readings_integrate_to_the_course() -> None:
 
 
 def test_the_course_keeps_speed_height_and_path() -> None:
-    course = fly(PATH, FlightSettings(agl_sigma_m=2.0), 9)
+    course = fly(PATH, SimulationSettings(agl_sigma_m=2.0), 9)
     speed = np.linalg.norm(np.diff(course.xyz_m[:, :2], axis=0), axis=1) * RATE_HZ
     assert speed.mean() == pytest.approx(5.0, rel=0.02)
     assert speed.min() > 4.0
@@ -379,7 +379,7 @@ def test_paths(tmp_path: Path) -> None:
 
 
 def test_placing_finds_built_up_ground_inside_the_map() -> None:
-    half = Ground.from_polygons([p for p in POLYGONS if p.centroid.x > LEFT + SIZE / 2])
+    half = RaisedFootprints.from_polygons([p for p in POLYGONS if p.centroid.x > LEFT + SIZE / 2])
     for seed in range(5):
         path = place(rectangle((0, 0), 0.0, 500.0), half, seed, BOUNDS, margin_m=60.0)
         assert (path >= np.array(BOUNDS[:2]) + 60.0 - 1e-6).all()
@@ -390,7 +390,9 @@ def test_placing_finds_built_up_ground_inside_the_map() -> None:
 
 
 def test_ground_without_buildings_gives_blank_masks() -> None:
-    blank = simulate_views(Ground.from_polygons([]), PATH, replace(SHORT, masks=MaskErrors.none()), 1)
+    blank = simulate_views(
+        RaisedFootprints.from_polygons([]), PATH, replace(SHORT, masks=MaskErrors.none()), 1
+    )
     assert all(view.building.max() == 0 and view.known.any() for view in blank.views)
 
 

@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 from brmgeo.errors import MissingInputError, SettingsError
-from brmgeo.synth.flight import FlightSettings, MaskErrors, OdometryErrors, read_simulation_settings
+from brmgeo.synth.flight import MaskErrors, OdometryErrors, SimulationSettings, read_simulation_settings
 
 DOCS = Path(__file__).parents[2] / "docs" / "FLIGHT.md"
 
 
-def read(tmp_path: Path, text: str) -> FlightSettings:
+def read(tmp_path: Path, text: str) -> SimulationSettings:
     (tmp_path / "s.toml").write_text(text)
-    return read_simulation_settings(tmp_path / "s.toml", FlightSettings())
+    return read_simulation_settings(tmp_path / "s.toml", SimulationSettings())
 
 
 def test_every_setting_of_the_simulator_can_be_given(tmp_path: Path) -> None:
-    for section, model in (("", FlightSettings), ("masks", MaskErrors), ("odometry", OdometryErrors)):
+    for section, model in (("", SimulationSettings), ("masks", MaskErrors), ("odometry", OdometryErrors)):
         for field in fields(model):
             if field.name in ("camera", "mount", "masks", "odometry"):
                 continue
@@ -80,4 +80,4 @@ def test_what_nobody_knows_is_refused_in_one_line(tmp_path: Path, text: str, wor
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     with pytest.raises(MissingInputError, match="no such file"):
-        read_simulation_settings(tmp_path / "none.toml", FlightSettings())
+        read_simulation_settings(tmp_path / "none.toml", SimulationSettings())

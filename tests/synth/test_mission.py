@@ -11,7 +11,7 @@ import shapely
 from brmgeo.errors import InputError, MissingInputError
 from brmgeo.locate.maps import read_maps
 from brmgeo.region import FlightSettings
-from brmgeo.synth.flight import Ground
+from brmgeo.synth.flight import RaisedFootprints
 from brmgeo.synth.mission import (
     PATHS,
     flight_path,
@@ -28,14 +28,14 @@ LENGTH_M = {"rectangle": 1075.0, "lawnmower": 2300.0, "random": 1500.0}
 
 
 @pytest.fixture(scope="module")
-def ground() -> Ground:
+def ground() -> RaisedFootprints:
     """Houses of 10 m, 40 m apart, all over the town."""
     places = [(x, y) for x in range(20, 1200, 40) for y in range(20, 1000, 40)]
-    return Ground.from_polygons([shapely.box(x, y, x + 10, y + 10) for x, y in places])
+    return RaisedFootprints.from_polygons([shapely.box(x, y, x + 10, y + 10) for x, y in places])
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_named_paths_stay_on_the_map(ground: Ground, path: str) -> None:
+def test_named_paths_stay_on_the_map(ground: RaisedFootprints, path: str) -> None:
     routes = [flight_path(path, ground, seed, TOWN, "EPSG:5187") for seed in range(5)]
     for route in routes:
         assert ((route >= TOWN[:2]) & (route <= TOWN[2:])).all()
@@ -46,12 +46,12 @@ def test_named_paths_stay_on_the_map(ground: Ground, path: str) -> None:
 
 
 @pytest.mark.parametrize("path", ["rectangle", "lawnmower"])
-def test_a_path_that_does_not_fit_is_told(ground: Ground, path: str) -> None:
+def test_a_path_that_does_not_fit_is_told(ground: RaisedFootprints, path: str) -> None:
     with pytest.raises(InputError, match="does not fit"):
         flight_path(path, ground, 1, (0.0, 0.0, 300.0, 300.0), "EPSG:5187")
 
 
-def test_a_path_that_nobody_knows_names_its_parameter(ground: Ground) -> None:
+def test_a_path_that_nobody_knows_names_its_parameter(ground: RaisedFootprints) -> None:
     with pytest.raises(MissingInputError, match="rectangel: give rectangle, lawnmower, random") as caught:
         flight_path("rectangel", ground, 1, TOWN, "EPSG:5187")
     assert caught.value.needs == "path"

@@ -15,7 +15,7 @@ from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu
 from brmgeo.flight.vio.delay import MAX_DELAY_S
 from brmgeo.flight.vio.filter import LEVEL_S, VioFilter, VioSettings
 from brmgeo.flight.vio.kernels import TH
-from brmgeo.flight.vio.warm import Seen, warm_up
+from brmgeo.flight.vio.warm import TimedFrame, warm_up
 
 #: The warm start holds no more of its pictures than this.
 WARM_BYTES = 256_000_000
@@ -93,7 +93,7 @@ class Vio:
         self._interval_s, self._segment = interval_s, segment
         self._filter: VioFilter | None = None
         self._newest: VioStep | None = None
-        self._waiting: deque[Seen] = deque()
+        self._waiting: deque[TimedFrame] = deque()
         self._last_t = -math.inf
         self._readings: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque()
         self._read_to = -math.inf
@@ -177,7 +177,7 @@ class Vio:
                 f"a frame at {t_s:.6f} s after one at {self._last_t:.6f} s: give them in order of time"
             )
         self._last_t = float(t_s)
-        self._waiting.append(Seen(float(t_s), picture, float(agl_m)))
+        self._waiting.append(TimedFrame(float(t_s), picture, float(agl_m)))
         return self._go_on()
 
     def finish(self) -> list[VioStep]:
@@ -239,7 +239,7 @@ class Vio:
             self._merge(vio)
             vio.advance(self._read_to - IDLE_S)
 
-    def _taken(self, vio: VioFilter, frame: Seen) -> VioStep:
+    def _taken(self, vio: VioFilter, frame: TimedFrame) -> VioStep:
         tracks, blind = vio.frame(*frame)
         variance = vio.step_variance()
         self._walk_m2 = max(self._walk_m2, variance)

@@ -12,7 +12,7 @@ from brmgeo.flight.vio.delay import coarse_delay
 from brmgeo.flight.vio.filter import VioFilter
 
 
-class Seen(NamedTuple):
+class TimedFrame(NamedTuple):
     """One frame: its time in seconds, the grey picture (h, w) uint8, and the height above ground in metres."""
 
     t_s: float
@@ -20,7 +20,7 @@ class Seen(NamedTuple):
     agl_m: float
 
 
-def warm_up(vio: VioFilter, first: Sequence[Seen], interval_s: float | None = None) -> None:
+def warm_up(vio: VioFilter, first: Sequence[TimedFrame], interval_s: float | None = None) -> None:
     """Starts ``vio``, a new filter, with what another one makes of the flight's first frames.
 
     Args:

@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, NEATLINE_LAYER, layer_code
 from brmgeo.errors import InputError, SettingsError
 from brmgeo.extras import extra
-from brmgeo.ingest.dxf.chains import Drawn, close
+from brmgeo.ingest.dxf.chains import DrawnRings, close
 from brmgeo.ingest.dxf.entities import block_lines, in_modelspace, lines_on
 from brmgeo.ingest.dxf.tags import Tags, text_of
-from brmgeo.ingest.repair import DROPPED_KINDS, Repair, Rings, repair_counts, repair_rings
+from brmgeo.ingest.repair import DROPPED_KINDS, ClosedOutlines, Repair, repair_counts, repair_rings
 
 with extra("maps", "reading DXF sheets"):
     import geopandas as gpd
@@ -103,7 +103,7 @@ def read_dxf(
     tags = Tags(text_of(path), path.name)
     drawn = _draw(tags, wanted, snap_m, sagitta_m, max_block_uses)
 
-    rings = Rings(drawn.polygons(), _objects(drawn.layers), _objects(drawn.handles))
+    rings = ClosedOutlines(drawn.polygons(), _objects(drawn.layers), _objects(drawn.handles))
     repaired = repair_rings(rings, path.name)
     repairs = sorted(drawn.repairs + repaired.repairs, key=lambda r: (r.kind, r.layer, r.handle, r.x, r.y))
     layer = rings.layers[repaired.origin]
@@ -168,10 +168,10 @@ def _escaped(name: str) -> bytes:
 
 def _draw(
     tags: Tags, wanted: dict[bytes, str], snap_m: float, sagitta_m: float, max_block_uses: int
-) -> Drawn:
-    """Rings on the wanted layers of modelspace."""
+) -> DrawnRings:
+    """Closed outlines on the wanted layers of modelspace."""
     assert tags.entities is not None
-    drawn = Drawn(counts=dict.fromkeys(("z_dropped", "bulges", "chained"), 0))
+    drawn = DrawnRings(counts=dict.fromkeys(("z_dropped", "bulges", "chained"), 0))
     heads = in_modelspace(tags, np.arange(*tags.entities))
     lines = lines_on(tags, heads, wanted, sagitta_m, drawn.counts)
     lines += block_lines(tags, heads, wanted, snap_m, sagitta_m, max_block_uses, drawn.counts)
@@ -183,7 +183,7 @@ def _neatline(tags: Tags, snap_m: float, sagitta_m: float) -> shapely.Polygon | 
     """The largest ring on the sheet frame's layer, or None."""
     assert tags.entities is not None
     wanted = {NEATLINE_LAYER.encode(): NEATLINE_LAYER, NEATLINE_LAYER[4:].encode(): NEATLINE_LAYER}
-    drawn = Drawn(counts=dict.fromkeys(("z_dropped", "bulges", "chained"), 0))
+    drawn = DrawnRings(counts=dict.fromkeys(("z_dropped", "bulges", "chained"), 0))
     heads = in_modelspace(tags, np.arange(*tags.entities))
     close(lines_on(tags, heads, wanted, sagitta_m, drawn.counts), wanted, snap_m, drawn, tags.name)
     frames = [polygon for polygon in drawn.polygons() if polygon.is_valid and polygon.area > 0.0]

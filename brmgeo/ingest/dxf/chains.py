@@ -15,7 +15,7 @@ from brmgeo.ingest.repair import Repair
 
 
 @dataclass(slots=True)
-class Drawn:
+class DrawnRings:
     """Closed rings found so far, as parallel lists, and what was seen on the way."""
 
     rings: list[NDArray[np.float64]] = field(default_factory=list)
@@ -35,7 +35,7 @@ class Drawn:
         return np.asarray(shapely.polygons(rings), dtype=object)
 
 
-def close(lines: list[Line], wanted: dict[bytes, str], snap_m: float, drawn: Drawn, source: str) -> None:
+def close(lines: list[Line], wanted: dict[bytes, str], snap_m: float, drawn: DrawnRings, source: str) -> None:
     """Turns lines into rings: closed ones as they are, near-closed ones snapped, the rest chained end to end."""
     loose: dict[str, list[Line]] = {}
     for line in lines:
@@ -64,7 +64,7 @@ def close(lines: list[Line], wanted: dict[bytes, str], snap_m: float, drawn: Dra
         _chain(layer, members, snap_m, drawn, source)
 
 
-def _chain(layer: str, members: list[Line], snap_m: float, drawn: Drawn, source: str) -> None:
+def _chain(layer: str, members: list[Line], snap_m: float, drawn: DrawnRings, source: str) -> None:
     """Rings from the open lines of one layer, joined where their ends lie within ``snap_m``; the others are dropped."""
     ends = np.concatenate([line.xy[[0, -1]] for line in members])
     joined = _snapped(ends, snap_m)

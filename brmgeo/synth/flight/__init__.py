@@ -15,22 +15,22 @@ from __future__ import annotations
 from brmgeo.synth.flight.camera import Simulator, frame_name
 from brmgeo.synth.flight.course import RATE_HZ, Course, fly
 from brmgeo.synth.flight.folder import simulate
-from brmgeo.synth.flight.ground import Ground, Imagery
+from brmgeo.synth.flight.ground import Imagery, RaisedFootprints
 from brmgeo.synth.flight.paths import lawnmower, path_from_geojson, place, random_mission, rectangle
 from brmgeo.synth.flight.sensors import imu_of, odometry_of
-from brmgeo.synth.flight.settings import FlightSettings, MaskErrors, OdometryErrors
+from brmgeo.synth.flight.settings import MaskErrors, OdometryErrors, SimulationSettings
 from brmgeo.synth.flight.settings_file import read_simulation_settings
 from brmgeo.synth.flight.views import SimulatedViews, simulate_views
 
 __all__ = [
     "RATE_HZ",
     "Course",
-    "FlightSettings",
-    "Ground",
     "Imagery",
     "MaskErrors",
     "OdometryErrors",
+    "RaisedFootprints",
     "SimulatedViews",
+    "SimulationSettings",
     "Simulator",
     "fly",
     "frame_name",

@@ -18,8 +18,8 @@ from brmgeo.flight.readings import Camera, FloatArray
 from brmgeo.flight.values import View
 from brmgeo.flight.view import make_view
 from brmgeo.synth.flight.course import LATENT, MASK, PICTURE, RATE_HZ, Course
-from brmgeo.synth.flight.ground import Ground, Imagery
-from brmgeo.synth.flight.settings import FlightSettings
+from brmgeo.synth.flight.ground import Imagery, RaisedFootprints
+from brmgeo.synth.flight.settings import SimulationSettings
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -136,8 +136,8 @@ class _Pose(NamedTuple):
 class Simulator:
     """Draws what the camera of one flight sees; every frame has randomness of its own, whatever the order."""
 
-    ground: Ground
-    settings: FlightSettings
+    ground: RaisedFootprints
+    settings: SimulationSettings
     course: Course
     seed: int
 
@@ -162,7 +162,7 @@ class Simulator:
         self,
         image: NDArray[Any],
         pose: _Pose,
-        ground: Ground,
+        ground: RaisedFootprints,
         chosen: NDArray[np.int64],
         values: NDArray[Any],
         heights: FloatArray,
@@ -348,7 +348,7 @@ def _walls(
 
 
 def _motion_blur(
-    light: NDArray[np.float32], settings: FlightSettings, course: Course, row: int
+    light: NDArray[np.float32], settings: SimulationSettings, course: Course, row: int
 ) -> NDArray[np.float32]:
     # The picture's own movement while the shutter is open, at its centre, as a short line of light.
     rotations = [world_from_camera(settings.mount, *course.roll_pitch_yaw[i]) for i in (row, row + 1)]
@@ -392,7 +392,7 @@ def _hash_uniform(index: NDArray[np.int64], seed: int) -> FloatArray:
 
 def _blobs(
     rng: np.random.Generator, n: int, box: tuple[float, float, float, float], radius_m: float
-) -> Ground:
+) -> RaisedFootprints:
     # Star-shaped outlines with a few lobes, anywhere in the box.
     corners = 24
     angle = np.linspace(0.0, 2.0 * math.pi, corners + 1)
@@ -405,7 +405,7 @@ def _blobs(
     xy = centre[:, None, :] + outline[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     none = np.zeros(n)
     starts = np.arange(n + 1, dtype=np.int64)
-    return Ground(xy.reshape(-1, 2), starts * (corners + 1), starts, np.zeros((n, 4)), none, none)
+    return RaisedFootprints(xy.reshape(-1, 2), starts * (corners + 1), starts, np.zeros((n, 4)), none, none)
 
 
 def _flip(image: NDArray[np.uint8], share: float, rng: np.random.Generator) -> None:

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.errors import InputError
 from brmgeo.flight.readings import FloatArray
-from brmgeo.synth.flight.settings import FlightSettings
+from brmgeo.synth.flight.settings import SimulationSettings
 
 RATE_HZ = 100
 
@@ -78,7 +78,7 @@ def _smooth_noise(rng: np.random.Generator, n: int, seconds: float) -> FloatArra
     return np.interp(np.arange(n), np.arange(len(coarse)) * stride, coarse)
 
 
-def fly(path: FloatArray, settings: FlightSettings, seed: int) -> Course:
+def fly(path: FloatArray, settings: SimulationSettings, seed: int) -> Course:
     """The true course along ``path`` (k, 2; metres in the map frame) and the instruments' readings at the frames.
 
     Raises InputError for a path of fewer than two different points, or a speed, interval or height that is not positive.

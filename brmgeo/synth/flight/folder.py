@@ -15,17 +15,17 @@ from brmgeo.flight.write import FlightParts, rounded, write_flight, write_mask, 
 from brmgeo.geo.crs import LONLAT, convergence_rad, transformer
 from brmgeo.synth.flight.camera import Simulator, frame_name
 from brmgeo.synth.flight.course import RATE_HZ, Course, fly
-from brmgeo.synth.flight.ground import Ground, Imagery
+from brmgeo.synth.flight.ground import Imagery, RaisedFootprints
 from brmgeo.synth.flight.sensors import altimeter_of, imu_of, odometry_of
-from brmgeo.synth.flight.settings import FlightSettings
+from brmgeo.synth.flight.settings import SimulationSettings
 
 
 def simulate(
     out: Path | str,
-    ground: Ground,
+    ground: RaisedFootprints,
     path: FloatArray,
     crs: str,
-    settings: FlightSettings | None = None,
+    settings: SimulationSettings | None = None,
     seed: int = 0,
     *,
     mode: Literal["masks", "frames", "both"] = "masks",
@@ -47,7 +47,7 @@ def simulate(
     Raises InputError when ``out`` holds files already, or pictures are wanted without imagery.
     """
     out = Path(out)
-    settings = settings or FlightSettings()
+    settings = settings or SimulationSettings()
     if mode != "masks" and imagery is None:
         raise InputError(f"mode {mode!r} draws pictures and needs imagery: give some, or choose mode 'masks'")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -106,5 +106,5 @@ def _reference(course: Course, crs: str, lonlat: bool) -> Reference:
     return Reference(t, xy)
 
 
-def _flat(ground: Ground) -> Ground:
+def _flat(ground: RaisedFootprints) -> RaisedFootprints:
     return replace(ground, height_m=np.zeros_like(ground.height_m))

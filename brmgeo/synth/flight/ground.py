@@ -19,7 +19,7 @@ EDGE_STEP_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class RaisedFootprints:
     """Footprints made ready for drawing; make it once with ``from_polygons`` and use it for many flights.
 
     Attributes:
@@ -39,7 +39,9 @@ class Ground:
     height_m: FloatArray
 
     @classmethod
-    def from_polygons(cls, polygons: Sequence[Any], heights_m: Sequence[float] | None = None) -> Ground:
+    def from_polygons(
+        cls, polygons: Sequence[Any], heights_m: Sequence[float] | None = None
+    ) -> RaisedFootprints:
         """Ready ground from shapely Polygons or MultiPolygons (map CRS, metres) and their heights."""
         geometries = np.asarray(list(polygons), dtype=object)
         heights = np.zeros(len(geometries)) if heights_m is None else np.asarray(heights_m, dtype=np.float64)

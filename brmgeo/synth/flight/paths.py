@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter
 from brmgeo.errors import InputError
 from brmgeo.flight.readings import FloatArray
 from brmgeo.geo.crs import LONLAT, transformer
-from brmgeo.synth.flight.ground import Ground
+from brmgeo.synth.flight.ground import RaisedFootprints
 
 
 def rectangle(
@@ -98,7 +98,7 @@ def path_from_geojson(file: Path | str, crs: str) -> FloatArray:
 
 def place(
     shape: FloatArray,
-    ground: Ground,
+    ground: RaisedFootprints,
     seed: int,
     bounds: tuple[float, float, float, float] | None = None,
     margin_m: float = 60.0,

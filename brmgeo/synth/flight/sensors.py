@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.flight.readings import Altimeter, Imu, Odometry
 from brmgeo.synth.flight.course import ODOMETRY, RATE_HZ, SENSORS, Course
-from brmgeo.synth.flight.settings import FlightSettings, OdometryErrors
+from brmgeo.synth.flight.settings import OdometryErrors, SimulationSettings
 
 
 def odometry_of(course: Course, errors: OdometryErrors, seed: int) -> Odometry:
@@ -72,7 +72,7 @@ def imu_of(course: Course, seed: int) -> Imu:
     return Imu(course.t_s, gyro, accel)
 
 
-def altimeter_of(course: Course, settings: FlightSettings, seed: int) -> Altimeter:
+def altimeter_of(course: Course, settings: SimulationSettings, seed: int) -> Altimeter:
     """Heights above ground along a course, ten a second, with the errors of the settings."""
     rng = np.random.default_rng([seed, SENSORS, 2])
     tenth = slice(None, None, RATE_HZ // 10)

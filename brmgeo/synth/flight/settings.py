@@ -77,7 +77,7 @@ class OdometryErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class FlightSettings:
+class SimulationSettings:
     """How the simulated aircraft flies and what its instruments are worth.
 
     Attributes:
@@ -122,7 +122,7 @@ class FlightSettings:
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92
     sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 152.0
 
-    def exact(self) -> FlightSettings:
+    def exact(self) -> SimulationSettings:
         """The same flight with perfect instruments and masks."""
         return replace(
             self,

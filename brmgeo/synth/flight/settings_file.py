@@ -12,24 +12,24 @@ from pydantic import Field
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.settings import Toml, build, read_toml
-from brmgeo.synth.flight.settings import FlightSettings
+from brmgeo.synth.flight.settings import SimulationSettings
 
 _Pixels = Annotated[int, Field(ge=8, le=30000)]
 _Focal = Annotated[float, Field(ge=1.0)]
 
 
-def read_simulation_settings(path: Path, base: FlightSettings) -> FlightSettings:
+def read_simulation_settings(path: Path, base: SimulationSettings) -> SimulationSettings:
     """``base`` with what a TOML file changes.
 
-    Top-level keys are those of ``FlightSettings`` (``agl_sigma_m``, ``exposure_s``, ``noise_levels``, ...), ``[masks]`` and
-    ``[odometry]`` those of ``MaskErrors`` and ``OdometryErrors``; ``[camera]`` and ``[mount]`` are as in flight.toml.
+    Top-level keys are those of ``SimulationSettings`` (``agl_sigma_m``, ``exposure_s``, ``noise_levels``, ...), ``[masks]``
+    and ``[odometry]`` those of ``MaskErrors`` and ``OdometryErrors``; ``[camera]`` and ``[mount]`` are as in flight.toml.
 
     Raises MissingInputError when there is no such file, SettingsError for what is not TOML, a key that nobody knows
     (with the nearest one) and a value of another type or out of range.
     """
     toml = read_toml(path)
     plain = {key: value for key, value in toml.data.items() if key not in ("camera", "mount")}
-    made = build(replace(toml, data=plain), FlightSettings, base)
+    made = build(replace(toml, data=plain), SimulationSettings, base)
     if "camera" in toml.data:
         made = replace(made, camera=_camera(toml, base.camera))
     if "mount" in toml.data:

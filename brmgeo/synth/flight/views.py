@@ -10,9 +10,9 @@ from brmgeo.flight.readings import FloatArray, Reference
 from brmgeo.flight.values import Motion, View
 from brmgeo.synth.flight.camera import Simulator
 from brmgeo.synth.flight.course import fly
-from brmgeo.synth.flight.ground import Ground
+from brmgeo.synth.flight.ground import RaisedFootprints
 from brmgeo.synth.flight.sensors import odometry_of
-from brmgeo.synth.flight.settings import FlightSettings
+from brmgeo.synth.flight.settings import SimulationSettings
 
 
 class SimulatedViews(NamedTuple):
@@ -25,9 +25,9 @@ class SimulatedViews(NamedTuple):
 
 
 def simulate_views(
-    ground: Ground,
+    ground: RaisedFootprints,
     path: FloatArray,
-    settings: FlightSettings | None = None,
+    settings: SimulationSettings | None = None,
     seed: int = 0,
     gsd_m: float = 0.5,
     *,
@@ -42,7 +42,7 @@ def simulate_views(
         gsd_m: ground sampling distance of the views.
         view_options: handed to ``make_view``.
     """
-    settings = settings or FlightSettings()
+    settings = settings or SimulationSettings()
     course = fly(path, settings, seed)
     simulator = Simulator(ground, settings, course, seed)
     views = [
