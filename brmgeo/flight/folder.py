@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from brmgeo.errors import CrsError, FlightError, InputError
+from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
@@ -288,10 +287,8 @@ def may_be_remade(folder: Path) -> bool:
     A flight that only a comment calls simulated may be a real one, written over a copied file.
     """
     try:
-        return (
-            tomllib.loads((folder / "flight.toml").read_text(encoding="utf-8-sig")).get("simulated") is True
-        )
-    except (OSError, ValueError):
+        return read_toml(folder / "flight.toml").data.get("simulated") is True
+    except BrmgeoError:
         return False
 
 

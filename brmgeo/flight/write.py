@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -25,6 +24,7 @@ from brmgeo.flight.folder import Flight
 from brmgeo.flight.readings import Altimeter, Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
 from brmgeo.geo.crs import LONLAT, parse_crs
 from brmgeo.pictures import encode
+from brmgeo.settings import read_toml
 
 #: Decimals that each kind of number is written with: the first of them that holds all of a file's numbers.
 DECIMALS: dict[str, tuple[int, ...]] = {
@@ -157,12 +157,12 @@ def write_track(
 def name_track(folder: Path, section: Mapping[str, str], made_by: str) -> None:
     """Adds [odometry] to a flight.toml that has none: the keys that ``write_track`` gave, and who made it."""
     path = folder / "flight.toml"
-    text = path.read_text(encoding="utf-8-sig")
-    if "odometry" in tomllib.loads(text):
+    toml = read_toml(path, error=FlightError, missing=FlightError)
+    if "odometry" in toml.data:
         return
     lines = _section("odometry", section)
     lines[0] += f"  # made by `{made_by}`"
-    files.write_text(path, text.rstrip("\n") + "\n" + "\n".join(lines) + "\n")
+    files.write_text(path, toml.text.rstrip("\n") + "\n" + "\n".join(lines) + "\n")
 
 
 def write_picture(folder: Path, file: str, rgb: NDArray[np.uint8], *, quality: int = 92) -> None:

@@ -285,3 +285,12 @@ def test_a_track_is_named_where_none_is(tmp_path: Path) -> None:
     assert (tmp_path / "odometry.covariance.csv").read_text() == (
         "t_s,walk_m2,yaw_sigma_deg,tracks,blind\n0.000000,0.000000,0.0000,0,0\n5.000000,1.500000,0.2500,90,1\n"
     )
+
+
+def test_a_flight_toml_that_is_none_is_not_taken_for_a_simulated_flight(tmp_path: Path) -> None:
+    assert not may_be_remade(tmp_path)
+    for text in ("simulated = ", "simulated = true\na = " + "[" * 100_000, 'simulated = "true"'):
+        (tmp_path / "flight.toml").write_text(text, encoding="utf-8")
+        assert not may_be_remade(tmp_path)
+    (tmp_path / "flight.toml").write_bytes(b"\xef\xbb\xbfsimulated = true\r\n")
+    assert may_be_remade(tmp_path)
