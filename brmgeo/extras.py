@@ -12,6 +12,7 @@ EXTRAS = {
     "maps": frozenset(
         (
             "bokeh",
+            "contourpy",
             "dask",
             "distributed",
             "ezdxf",

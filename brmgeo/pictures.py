@@ -16,19 +16,16 @@ from brmgeo.errors import InputError, MissingInputError
 
 #: Endings of the picture files that are looked for in folders.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-_ENDS = (b"\xff\xd9", b"IEND\xaeB`\x82")
 
 
 def fault_of(data: bytes) -> str | None:
     """What is wrong with the bytes of a picture file, in a few words; None for a whole picture.
 
-    OpenCV fills up what is missing of a picture with grey and says nothing; Pillow refuses it. A JPEG or PNG that ends as
-    it must is not decoded for this.
+    OpenCV fills up what is missing of a picture with grey and says nothing; Pillow refuses it. So it is decoded twice, which
+    costs three milliseconds a 640 x 480 JPEG.
     """
     if not data:
         return "the file is empty"
-    if data.endswith(_ENDS):
-        return None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large pictures and odd tags, which do not matter here

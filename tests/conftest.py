@@ -16,6 +16,7 @@ import rasterio
 import rasterio.features
 import shapely
 from affine import Affine
+from hypothesis import settings as hypothesis_settings
 from pyproj import Transformer
 from small_flights import COLS, CRS, GSD, LEFT, REAL, ROWS, TOP, Said, make_flight
 
@@ -24,6 +25,11 @@ from brmgeo.match import METHODS
 from brmgeo.segment.predict import Segmenter
 from brmgeo.synth.flight import Imagery, RaisedFootprints, SimulationSettings, simulate
 from pipelines.cli import cli, run
+
+# The everyday run is the same for everyone; pytest --hypothesis-profile=explore looks further.
+hypothesis_settings.register_profile("everyday", derandomize=True)
+hypothesis_settings.register_profile("explore", derandomize=False)
+hypothesis_settings.load_profile("everyday")
 
 
 @pytest.fixture

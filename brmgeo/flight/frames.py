@@ -26,8 +26,8 @@ MIN_WANDER = 0.02
 CLEAR_SHARE = 0.67
 #: No vehicle flies beyond this on average, and a body that is not turned in its vehicle stays below that.
 UPSIDE_DOWN_DEG, UPRIGHT_DEG = 150.0, 60.0
-#: More wander than this is tumbling.
-MAX_WANDER = 0.2
+#: More wander than this is tumbling; more than this is steeper banking than 20 degrees (standard deviation).
+MAX_WANDER, MAX_BANKING = 0.2, 0.06
 
 
 def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -148,7 +148,9 @@ def likely_order(values: FloatArray) -> QuaternionOrder | None:
     for order, other in (orders, orders[::-1]):
         # On a straight course it is leaning that wanders, in both readings; but one of them lies on its back.
         if tilt[order] < UPRIGHT_DEG and wander[order] < MAX_WANDER and tilt[other] > UPSIDE_DOWN_DEG:
-            return order
+            # Steep banking and a turning flight with its sensor built in upside down look the same.
+            clear = wander[order] < MAX_BANKING or wander[other] > CLEAR_SHARE * wander[order]
+            return order if clear else None
     for order, other in (orders, orders[::-1]):
         if wander[other] > MIN_WANDER and wander[order] < CLEAR_SHARE * wander[other]:
             return order

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.extras import extra
 from brmgeo.pictures import decode, read_bytes
 from brmgeo.segment.weights import ModelCard
 
@@ -245,7 +244,7 @@ class Segmenter:
     @classmethod
     def load(
         cls,
-        path: Path | None = None,
+        path: Path | str | None = None,
         backend: str | None = None,
         threads: int | None = None,
         looks: int | None = None,
@@ -266,7 +265,7 @@ class Segmenter:
         """
         if backend is not None and backend not in get_args(Backend):
             raise SettingsError(f"backend {backend!r}: give one of {', '.join(get_args(Backend))}")
-        given = path or SHIPPED
+        given = SHIPPED if path is None else Path(path)
         if given.suffix not in (".onnx", ".safetensors"):
             raise InputError(
                 f"{given}: weights are .safetensors or .onnx files; others (such as pickles) are never opened"
@@ -284,22 +283,19 @@ class Segmenter:
             from brmgeo.segment.weights import load_network
 
             # An .onnx of it, made where torch is installed, runs without.
-            with extra("train", f"running {tensors} with torch"):
-                network, card = load_network(tensors)
+            network, card = load_network(tensors)
             runs = _TorchNetwork(network, card.temperature, threads)
             return cls(card, "torch", tensors, runs, card.looks if looks is None else looks)
         if not graph.is_file():
             raise MissingInputError(
-                f"{graph}: ONNX Runtime needs it; write it with brmgeo export-onnx {given}"
+                f"{graph}: ONNX Runtime needs it; export {given.name} as ONNX where torch is installed"
             )
         runner, card = _load_onnx(graph, threads)
         if given == tensors:
             from brmgeo.segment.weights import load_weights
 
             if load_weights(given)[1].sha256 != card.sha256:
-                raise InputError(
-                    f"{graph}: of other weights than {given.name} beside it; write it again with brmgeo export-onnx"
-                )
+                raise InputError(f"{graph}: of other weights than {given.name} beside it; export them anew")
         return cls(card, "onnx", graph, runner, card.looks if looks is None else looks)
 
     @property

@@ -228,7 +228,7 @@ def load_network(path: Path) -> tuple[UNet, ModelCard]:
 
 def build_network(tensors: Mapping[str, NDArray[Any]], card: ModelCard, name: str) -> UNet:
     """The network of a card with these tensors in it, in evaluation mode; InputError where they do not fit each other."""
-    with extra("train", "running the network in torch"):
+    with extra("train", f"running {name} with torch"):
         import torch
 
         from brmgeo.segment.unet import UNet, UNetSettings

@@ -122,6 +122,20 @@ def test_a_straight_course_with_banking_is_not_taken_for_the_other_order() -> No
     assert frames.likely_order(q[:, [1, 2, 3, 0]]) is None
 
 
+def test_a_sensor_that_is_built_in_upside_down_is_not_taken_for_banking() -> None:
+    # The heading wanders as steep banking would: told rightly, or not at all.
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        heading = np.cumsum(rng.normal(0, 0.1, 400)) + np.linspace(0.0, 5.0, 400)
+        flight = Rotation.from_euler("ZYX", np.c_[heading, rng.normal(0, 0.04, (400, 2))])
+        mount = Rotation.from_rotvec(
+            np.radians(rng.uniform(155, 180)) * np.array([1.0, 0.1, 0.0]) / np.hypot(1, 0.1)
+        )
+        q = wxyz(flight * mount)
+        assert frames.likely_order(q) in ("wxyz", None), seed
+        assert frames.likely_order(q[:, [1, 2, 3, 0]]) in ("xyzw", None), seed
+
+
 def test_the_order_is_not_told_where_nothing_tells_it() -> None:
     still = np.tile([0.5, 0.5, 0.5, 0.5], (50, 1))
     assert frames.likely_order(still) is None
