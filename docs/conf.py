@@ -29,7 +29,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_default_options = {"members": True, "undoc-members": False, "show-inheritance": False}
 # Arrays by their alias, not by the union that it stands for.
-autodoc_type_aliases = {name: name for name in ("FloatArray", "F64", "F32", "U8", "Geometries")}
+autodoc_type_aliases = {name: name for name in ("FloatArray", "F64", "F32", "U8", "Objects")}
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+# Words of attributes, such as "cells", are no references.
+suppress_warnings = ["ref.python"]

@@ -15,6 +15,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+#: (n,) shapely geometries, or texts.
+Objects = NDArray[np.object_]
 # Below this area (m2) an outline is no building, not even the sliver of one that a neatline cuts off (0.02 in real sheets).
 MIN_AREA_M2 = 0.01
 # An outline that turns back within half a degree of where it came from draws a spike, not a wall.
@@ -59,9 +61,9 @@ class ClosedOutlines:
         handles: (n,) object str.
     """
 
-    polygons: NDArray[np.object_]
-    layers: NDArray[np.object_]
-    handles: NDArray[np.object_]
+    polygons: Objects
+    layers: Objects
+    handles: Objects
 
 
 @dataclass(slots=True)
@@ -75,7 +77,7 @@ class Repaired:
         courtyards: number of rings that became holes.
     """
 
-    polygons: NDArray[np.object_]
+    polygons: Objects
     origin: NDArray[np.int64]
     repairs: list[Repair] = field(default_factory=list)
     courtyards: int = 0
@@ -131,7 +133,7 @@ def repair_counts(repairs: Iterable[Repair]) -> dict[str, int]:
     return dict(sorted(Counter(repair.kind for repair in repairs).items()))
 
 
-def shape_keys(polygons: NDArray[np.object_], decimals: int = _SAME_DECIMALS) -> list[bytes]:
+def shape_keys(polygons: Objects, decimals: int = _SAME_DECIMALS) -> list[bytes]:
     """A key a polygon, equal for equal outlines whatever their first vertex and sense of rotation.
 
     ``decimals`` of a metre count as the same coordinate.
@@ -164,7 +166,7 @@ def _turns(xy: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray((dot < 0.0) & (np.abs(cross) <= _SPIKE_SINE * scale), dtype=np.bool_)
 
 
-def _has_spike(polygons: NDArray[np.object_]) -> NDArray[np.bool_]:
+def _has_spike(polygons: Objects) -> NDArray[np.bool_]:
     """(n,) bool: polygons whose exterior turns back on itself somewhere; all rings at once."""
     out = np.zeros(len(polygons), dtype=np.bool_)
     if not len(polygons):
@@ -205,8 +207,8 @@ def _without_spikes(polygon: shapely.Polygon) -> tuple[shapely.Polygon | None, t
 
 
 def _made_valid(
-    polygons: NDArray[np.object_], rings: ClosedOutlines, done: Repaired, source: str
-) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    polygons: Objects, rings: ClosedOutlines, done: Repaired, source: str
+) -> tuple[Objects, NDArray[np.int64]]:
     """Valid polygons, one or more an outline, and the outline that each came from."""
     origin = np.arange(len(polygons), dtype=np.int64)
     bad = np.flatnonzero(~shapely.is_valid(polygons)) if len(polygons) else np.empty(0, dtype=np.int64)
@@ -255,8 +257,8 @@ def _reason_point(reason: str) -> tuple[float, float] | None:
 
 
 def _first_of_equals(
-    polygons: NDArray[np.object_],
-    layers: NDArray[np.object_],
+    polygons: Objects,
+    layers: Objects,
     rings: ClosedOutlines,
     origin: NDArray[np.int64],
     done: Repaired,
@@ -277,9 +279,7 @@ def _first_of_equals(
     return keep
 
 
-def _with_courtyards(
-    polygons: NDArray[np.object_], layers: NDArray[np.object_]
-) -> tuple[NDArray[np.object_], NDArray[np.bool_]]:
+def _with_courtyards(polygons: Objects, layers: Objects) -> tuple[Objects, NDArray[np.bool_]]:
     """Polygons with the rings inside them as holes, and which of the given ones became holes.
 
     ClosedOutlines are nested to any depth: a ring at odd depth is a courtyard, at even depth a building (in a courtyard).

@@ -40,7 +40,7 @@ def _search(maps, wanted, limit, counts, out, i0, i1):  # type: ignore[no-untype
 
 
 def search_ratios(maps: NDArray[np.uint16], f: F64, e1: float, out: U8) -> int:
-    """Mark every pixel with sum_k |M_k - f_k| < e1 (eq. 5); returns how many.
+    """Mark every pixel with ``sum_k |M_k - f_k| < e1`` (eq. 5); returns how many.
 
     Args:
         maps: (n, H, W) uint16 ratios x 1e-4, 65535 unknown: such a pixel is never marked.
@@ -174,7 +174,7 @@ def census(mask, stride, by_row, by_col, sample):  # type: ignore[no-untyped-def
 def ring_spans(distance: float, eps: float, inner: float | None = None) -> tuple[NDArray[np.int64], int]:
     """Row by row, the whole-pixel offsets that some heading allows: the union of boxes about a circle.
 
-    A pixel offset (dx, dy) belongs when |dx - d cos t| < eps and |dy - d sin t| < eps for some t. With
+    A pixel offset (dx, dy) belongs when ``|dx - d cos t| < eps`` and ``|dy - d sin t| < eps`` for some t. With
     ``inner`` 0 the whole disc of ``distance`` and its boxes belong (used where only the speed bounds the movement).
 
     Returns (2 reach + 1, 4) int64 spans [a, b) and [c, d) per row offset -reach..reach (an empty one has a >=

@@ -2,7 +2,7 @@
 
 One step:
 
-- **Search** (eq. 5): every map pixel with sum_k |M_k - f_k| < e1, over the n ratio maps at the frame's own radii.
+- **Search** (eq. 5): every map pixel with ``sum_k |M_k - f_k| < e1``, over the n ratio maps at the frame's own radii.
 - **Heading** (eq. 4): a candidate c of the frame before, that came from b one frame earlier, flew in the
   direction of c - b.
 - **Motion** (eq. 6): a pixel stays a candidate when it lies in the box of half side eps about (x + d cos

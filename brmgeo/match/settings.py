@@ -228,7 +228,7 @@ class PaperSettings:
 
     Attributes:
         radii: n, number of radii, [1, 16].
-        e1: bound of sum_k |M_k - f_k|, (0, 16].
+        e1: bound of ``sum_k |M_k - f_k|``, (0, 16].
         eps_m: half side of the box around the predicted point, metres, [0.1, 500].
         d_max_m: converged when every candidate lies this close to their mean, metres, [0.1, 1000].
         pair_work: eq. 4 is applied pair by pair while that takes no more box tests than this, [0, 1e10]; above it,

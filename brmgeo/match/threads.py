@@ -2,7 +2,7 @@
 
 The kernels are serial numba that lets go of the interpreter lock; work is split here. numba's own parallel
 loops are not used: their default scheduler must not be entered from two threads at once, and under load each
-    entry waits for all of its threads.
+entry waits for all of its threads.
 """
 
 from __future__ import annotations

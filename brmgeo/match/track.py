@@ -3,8 +3,7 @@
 Online it is an extended Kalman filter; the smoother (``brmgeo.match.smooth``) uses the same motion model over
 the whole flight. State: x, y (metres, map frame), psi (yaw of the odometry frame in the map, radians), s (log
 of the scale: a true step is exp(s) times the measured one). Scale and heading are states, not noise, because
-    their errors are the same from step to
-step: a bias of 5 % is 50 m after 1 km, and no noise per step explains that.
+their errors are the same from step to step: a bias of 5 % is 50 m after 1 km, and no noise per step explains that.
 """
 
 from __future__ import annotations

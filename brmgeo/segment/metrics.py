@@ -240,7 +240,7 @@ class LogitHistogram:
         return said, was, count.astype(np.int64)
 
     def calibration_error(self) -> float:
-        """Expected calibration error: mean over pixels of |share of building - probability| of their bin."""
+        """Expected calibration error: mean over pixels of ``|share of building - probability|`` of their bin."""
         said, was, count = self.reliability()
         filled = count > 0
         return float((np.abs(said - was)[filled] * count[filled]).sum() / max(int(count.sum()), 1))

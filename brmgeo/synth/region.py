@@ -37,7 +37,7 @@ def write_region(
     style: TownStyle | None = None,
     map: Mapper = map,
 ) -> dict[str, Any]:
-    """Writes ``out_dir``/sheets/*.dxf, tiles/L{level}/{y}/{x}.jpg and manifest.json; returns the manifest.
+    """Writes ``sheets/*.dxf``, ``tiles/L{level}/{y}/{x}.jpg`` and ``manifest.json`` into ``out_dir``; returns the manifest.
 
     Args:
         out_dir: an existing folder, visible to whatever ``map`` runs on.
