@@ -9,7 +9,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from small_flights import Said
+import pytest
+from small_flights import Said, make_flight
 from test_public import BARE, ROOT
 
 import brmgeo
@@ -21,7 +22,7 @@ PAGE = ROOT / "docs" / "tutorials" / "aboard.md"
 def test_the_program_aboard_says_what_localize_says(
     maps: Path, pictured: Path, weights: Path, tmp_path: Path, say: Callable[..., Said]
 ) -> None:
-    program, again = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
+    program, again, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
     assert len([line for line in program.splitlines() if line.strip()]) <= 20
     # The network of the tests, which takes the bright houses of their town for buildings.
     network = f"Segmenter.load({str(weights)!r})"
@@ -54,3 +55,24 @@ def test_the_program_aboard_says_what_localize_says(
         tmp_path / "here.brmgeo", read_maps(maps), masks=brmgeo.Segmenter.load(weights)
     )
     assert here is not None
+
+
+@pytest.mark.slow  # a flight at video rate is drawn and followed
+def test_the_program_with_odometry_of_its_own_follows_the_flight(
+    maps: Path, waypoints: Path, weights: Path, tmp_path: Path
+) -> None:
+    words = ("--mode", "frames", "--interval", 0.2, "--no-odometry")
+    filmed = make_flight(maps, waypoints, tmp_path / "filmed", *words)
+    *_, program = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
+    code = f"""
+import brmgeo
+maps, flight = brmgeo.read_maps({str(maps)!r}), brmgeo.read_flight({str(filmed)!r})
+{program.replace("Segmenter.load()", f"Segmenter.load({str(weights)!r})")}
+print(vio.pose is not None, fix.status, np.linalg.norm(fix.mean - flight.reference(maps.crs).at(np.array([fix.t_s]))[0]))
+"""
+    env = {"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", BARE + code], capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    pose, status, error_m = done.stdout.split()
+    assert (pose, status) == ("True", "converged")
+    assert float(error_m) < 5.0
