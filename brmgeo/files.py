@@ -48,6 +48,11 @@ def reason(error: OSError) -> str | None:
     return _REASONS.get(error.errno or 0)
 
 
+def told(error: OSError) -> str:
+    """What is wrong, for a person: the ``reason`` where there is one, else what the system or the library says."""
+    return reason(error) or error.strerror or str(error)
+
+
 def reason_of(number: int) -> str:
     """The words of an errno that ``reason`` knows."""
     return _REASONS[number]
@@ -160,14 +165,7 @@ def require_writable(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        fault = (
-            "a file stands there"
-            if isinstance(error, (FileExistsError, NotADirectoryError))
-            else error.strerror
-        )
-        raise WorkflowError(
-            f"results cannot be written to {folder} ({fault}); choose another place"
-        ) from None
+        raise WorkflowError(f"results cannot be written to {folder}: {told(error)}") from None
 
 
 def sync(path: Path) -> None:

@@ -22,6 +22,7 @@ from typing import Any, TypeGuard, TypeVar
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from brmgeo.errors import BrmgeoError, MissingInputError, SettingsError
+from brmgeo.files import told
 
 T = TypeVar("T")
 Keys = tuple[str | int, ...]
@@ -116,7 +117,7 @@ def read_toml(
     except FileNotFoundError:
         raise missing(f"{path}: there is no such file") from None
     except OSError as fault:
-        raise error(f"{path}: cannot be read: {fault.strerror}") from None
+        raise error(f"{path}: cannot be read: {told(fault)}") from None
     try:
         text = raw.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as fault:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from pyproj import Transformer
 
 from brmgeo.errors import CrsError, SettingsError, WorkflowError
+from brmgeo.files import told
 from brmgeo.geo.crs import (
     LONLAT,
     belt_for_lon,
@@ -177,9 +178,7 @@ def new_region(
             load_region(draft)
             os.replace(draft, path)
     except OSError as error:
-        raise WorkflowError(
-            f"{path} cannot be written: {error.strerror}; choose another --data folder"
-        ) from None
+        raise WorkflowError(f"{path} cannot be written: {told(error)} (--data)") from None
     return path
 
 

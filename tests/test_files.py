@@ -127,6 +127,9 @@ with files.whole_folder(pathlib.Path({str(tmp_path / "out")!r})) as scratch:
 def test_words_of_the_disk() -> None:
     assert "disk is full" in str(files.reason(OSError(errno.ENOSPC, "x")))
     assert files.reason(OSError(errno.ECHILD, "x")) is None
+    assert "disk is full" in files.told(OSError(errno.ENOSPC, "x"))
+    assert files.told(OSError(errno.ECHILD, "No child processes")) == "No child processes"
+    assert files.told(OSError("the library's own words")) == "the library's own words"
 
 
 def test_digest_and_copy(tmp_path: Path) -> None:
@@ -176,5 +179,5 @@ def test_a_place_that_cannot_be_written_is_told_before_any_work(tmp_path: Path) 
     assert not list((tmp_path / "new" / "folder").iterdir())
     (tmp_path / "file").touch()
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(WorkflowError, match=r"a file stands there\); choose another place"):
+        with pytest.raises(WorkflowError, match="a file stands where a folder is wanted"):
             files.require_writable(place)

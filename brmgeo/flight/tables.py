@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from brmgeo.errors import FlightError
+from brmgeo.files import told
 from brmgeo.flight.readings import FloatArray
 from brmgeo.settings import nearest
 
@@ -91,7 +92,7 @@ def read_text(path: Path) -> str:
     except FileNotFoundError:
         raise refuse(path, None, None, "the file is missing") from None
     except OSError as error:
-        raise refuse(path, None, None, f"the file cannot be read ({error.strerror})") from None
+        raise refuse(path, None, None, f"the file cannot be read ({told(error)})") from None
     except UnicodeDecodeError as error:
         raise refuse(
             path, None, None, f"byte {error.start} is not UTF-8 text: is this another format?"

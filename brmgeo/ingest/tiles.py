@@ -130,7 +130,7 @@ class TileFolder:
         except ValueError as error:
             raise InputError(f"tile {path}: {error}; replace the file, or delete it to do without") from None
         except OSError as error:
-            raise InputError(f"tile {path} cannot be read: {error.strerror or error}") from None
+            raise InputError(f"tile {path} cannot be read: {files.told(error)}") from None
 
     def held(self, most: int = 200_000) -> dict[int, tuple[int, Tile, Tile]]:
         """Level -> (number of tiles, smallest x and y, largest x and y) of the first ``most`` files under ``root``."""
@@ -541,9 +541,7 @@ class _Download:
                 files.write_json(record, mine, durable=True)
             files.clear_scratch(service.cache_dir, deep=True)
         except OSError as error:
-            raise WorkflowError(
-                f"cannot write tile cache {service.cache_dir}: {error.strerror or error}"
-            ) from None
+            raise WorkflowError(f"cannot write tile cache {service.cache_dir}: {files.told(error)}") from None
 
     def _absent(self, tile: Tile) -> Path:
         """The marker of a tile that the service says does not exist."""
@@ -593,7 +591,7 @@ class _Download:
             except OSError as error:
                 self.stop.set()
                 raise WorkflowError(
-                    f"cannot write tile cache {service.cache_dir}: {error.strerror or error}; free some space"
+                    f"cannot write tile cache {service.cache_dir}: {files.told(error)}"
                 ) from None
         return ""
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, WorkflowError
-from brmgeo.files import reason, whole_file
+from brmgeo.files import told, whole_file
 from brmgeo.match import MatchSettings
 
 _HEADER = "header"
@@ -35,7 +35,7 @@ def write_saved(path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDAr
                 with out.open(f"{name}.npy", "w", force_zip64=True) as part:
                     np.lib.format.write_array(part, np.asarray(array), allow_pickle=False)
     except OSError as error:
-        raise WorkflowError(f"{path}: cannot be written: {reason(error) or error.strerror}") from error
+        raise WorkflowError(f"{path}: cannot be written: {told(error)}") from error
 
 
 def read_saved(path: Path, version: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -52,7 +52,7 @@ def read_saved(path: Path, version: int) -> tuple[dict[str, Any], dict[str, NDAr
     except (FileNotFoundError, NotADirectoryError):
         raise MissingInputError(f"{path}: there is no such saved state") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error) or error.strerror}") from None
+        raise InputError(f"{path}: cannot be read: {told(error)}") from None
     except (
         zipfile.BadZipFile,
         ValueError,

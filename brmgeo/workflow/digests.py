@@ -55,7 +55,9 @@ class Digests:
                 f"{what}: {gone} is not there; put it there or correct its path"
             ) from None
         except OSError as error:
-            raise InputError(f"{what}: {error.filename or path} cannot be read: {error.strerror}") from None
+            raise InputError(
+                f"{what}: {error.filename or path} cannot be read: {files.told(error)}"
+            ) from None
         text = "".join(f"{digest} {name}\n" for name, digest in found.items())
         return files.digest_of(b"folder\n" + text.encode(errors="surrogateescape")), found
 

@@ -246,11 +246,11 @@ def test_output_is_a_file(
 ) -> None:
     (tmp_path / "file").write_text("in the way")
     words = ("maps", "small", "--data", region.data, "--out")
-    says(brmgeo(capsys, *words, tmp_path / "file" / "below"), "file", "choose another")
+    says(brmgeo(capsys, *words, tmp_path / "file" / "below"), "file", "choose another place")
     answer = brmgeo(capsys, *words, tmp_path / "file")
     assert answer.status == 2
     assert "file" in answer.err
-    says(brmgeo(capsys, *words, "/proc/here"), "/proc/here", "choose another")
+    says(brmgeo(capsys, *words, "/proc/here"), "/proc/here", "cannot be written", "check the name")
 
 
 def test_store_is_a_file(region: SmallRegion, capsys: Capture) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, one_line
 from brmgeo.extras import extra
+from brmgeo.files import told
 
 _NAME_BYTES = 64
 _BYTES_A_VALUE = 200
@@ -23,7 +24,7 @@ def text_of(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(f"{path}: cannot be read: {told(error)}") from error
     if not data.strip():
         raise InputError(f"{path.name}: the file is empty: export or download the sheet again")
     if re.match(rb"AC1\d\d\d", data):

@@ -11,6 +11,7 @@ import shapely
 from scipy.ndimage import uniform_filter
 
 from brmgeo.errors import InputError
+from brmgeo.files import told
 from brmgeo.flight.readings import FloatArray
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.synth.flight.ground import RaisedFootprints
@@ -87,7 +88,7 @@ def path_from_geojson(file: Path | str, crs: str) -> FloatArray:
         points = [g["coordinates"] for g in shapes if g["type"] == "Point"]
         lonlat = np.array([[float(v) for v in p[:2]] for p in (lines[0] if lines else points)])
     except OSError as error:
-        raise InputError(f"{file}: the waypoints cannot be read ({error.strerror})") from None
+        raise InputError(f"{file}: the waypoints cannot be read ({told(error)})") from None
     except (ValueError, KeyError, TypeError, IndexError):
         raise InputError(f"{file}: not a GeoJSON file with a LineString or Points") from None
     if len(lonlat) < 2 or (np.abs(lonlat) > [180.0, 90.0]).any():
