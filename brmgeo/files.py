@@ -7,6 +7,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -25,6 +26,8 @@ else:
 
 #: Names of scratch files and folders begin with this, beside what they become.
 SCRATCH = ".brmgeo-part-"
+# And those of folders that stand aside while another takes their place end with this.
+_OLD = ".old"
 
 _REASONS = {
     errno.ENOSPC: "the disk is full: free some space or choose another place",
@@ -117,12 +120,14 @@ def whole_folder(out: Path) -> Iterator[Path]:
     """An empty scratch folder beside ``out`` that takes its place when the block ends without an error.
 
     What stood at ``out`` goes with it; after an error it stays as it was. Whoever calls this has made sure that nothing
-    there is missed.
+    there is missed. What a run killed between the two renames left aside is put back first, and scratch folders of this
+    ``out`` that nobody has touched for an hour are removed.
     """
     out = out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
-    scratch = out.with_name(f"{SCRATCH}{uuid.uuid4().hex[:12]}")
-    old = out.with_name(f"{scratch.name}.old")
+    _tidy(out)
+    scratch = out.with_name(f"{SCRATCH}{out.name}-{uuid.uuid4().hex[:12]}")
+    old = out.with_name(f"{scratch.name}{_OLD}")
     scratch.mkdir()
     try:
         yield scratch
@@ -137,6 +142,32 @@ def whole_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _tidy(out: Path, older_than_s: float = 3600.0) -> None:
+    """Puts back what a killed ``whole_folder(out)`` had moved aside where ``out`` is missing, and removes its old litter."""
+    ours = re.compile(rf"{re.escape(f'{SCRATCH}{out.name}-')}[0-9a-f]{{12}}({re.escape(_OLD)})?")
+    found = sorted((p for p in out.parent.iterdir() if ours.fullmatch(p.name)), key=_last_touched)
+    aside = [p for p in found if p.name.endswith(_OLD)]
+    # Who asks whether a folder can be written makes it: an empty one holds nothing that could be lost.
+    if aside and (not out.exists() or (out.is_dir() and not any(out.iterdir()))):
+        with contextlib.suppress(FileNotFoundError):
+            out.rmdir()
+        os.rename(aside[-1], out)
+        found.remove(aside[-1])
+    before = time.time() - older_than_s
+    for path in found:
+        if _last_touched(path) < before:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _last_touched(folder: Path) -> float:
+    """When a folder or anything in it was last written, seconds since 1970; 0 for one that is gone."""
+    newest = 0.0
+    for path in (folder, *folder.rglob("*")):
+        with contextlib.suppress(OSError):  # its owner may clear it away just now
+            newest = max(newest, path.lstat().st_mtime)
+    return newest
 
 
 def require_replaceable(out: Path, sign: str, what: str, ours: Callable[[Path], bool]) -> None:

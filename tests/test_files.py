@@ -108,6 +108,71 @@ def test_a_folder_comes_whole_or_the_old_one_stays(tmp_path: Path) -> None:
     assert [p.name for p in out.parent.iterdir()] == ["out"]
 
 
+def killed_between_renames(out: Path) -> None:
+    """What a process leaves that dies when the old folder is aside and the new one not yet in its place."""
+    code = f"""
+import os, pathlib
+from brmgeo import files
+rename = os.rename
+def die(source, target):
+    rename(source, target)
+    os._exit(9)
+files.os.rename = die
+with files.whole_folder(pathlib.Path({str(out)!r})) as scratch:
+    (scratch / "new").touch()
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", code], check=False, cwd=Path(__file__).resolve().parents[1], timeout=60
+    )
+    assert run.returncode == 9
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_run_killed_between_the_renames_loses_nothing(tmp_path: Path, asked: bool) -> None:
+    out, other = tmp_path / "out", tmp_path / "out-2"
+    for folder in (out, other):
+        folder.mkdir()
+        (folder / "old").write_text(folder.name)
+        killed_between_renames(folder)
+        assert not folder.exists()
+    assert len([p for p in tmp_path.iterdir() if p.name.startswith(f"{files.SCRATCH}out-")]) == 4
+    if asked:
+        files.require_writable(out)
+
+    def fails() -> None:
+        with files.whole_folder(out):
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fails()
+    assert (out / "old").read_text() == "out"
+    # That of a folder with a longer name stays for whoever writes there.
+    assert not other.exists()
+    with files.whole_folder(other) as scratch:
+        assert (other / "old").read_text() == "out-2"
+        (scratch / "new").touch()
+    assert [p.name for p in other.iterdir()] == ["new"]
+
+
+def test_scratch_folders_of_killed_runs_are_cleared_after_an_hour(tmp_path: Path) -> None:
+    names = ("out-0123456789ab", "out-0123456789ac.old", "out-2-0123456789ab", "out-0123456789ad")
+    dead, aside, other, alive = [tmp_path / f"{files.SCRATCH}{name}" for name in names]
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "a").touch()
+    for folder in (dead, aside, other, alive):
+        (folder / "frames").mkdir(parents=True)
+        (folder / "frames" / "1.png").touch()
+        for path in (folder / "frames" / "1.png", folder / "frames", folder):
+            # A long run writes deep in its folder only.
+            if path.suffix != ".png" or folder != alive:
+                os.utime(path, (1e9, 1e9))
+    with files.whole_folder(out) as scratch:
+        (scratch / "b").touch()
+    assert {*tmp_path.iterdir()} == {out, other, alive}
+    assert [p.name for p in out.iterdir()] == ["b"]
+
+
 @pytest.mark.skipif(os.name != "posix", reason="file modes are POSIX's")
 def test_folders_have_the_mode_that_the_umask_asks_for(tmp_path: Path) -> None:
     # In a process of its own: the umask belongs to the whole process.
