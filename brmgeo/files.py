@@ -234,8 +234,12 @@ _FICLONE = 0x40049409
 
 
 def copy(source: Path, target: Path) -> None:
-    """A durable copy at a new path; shares blocks with its source on file systems that can (copy on write)."""
-    with open(source, "rb") as reader, open(target, "xb") as writer:
+    """A durable copy that appears whole; shares blocks with its source on file systems that can (copy on write)."""
+    with (
+        whole_file(target, durable=True) as scratch,
+        open(source, "rb") as reader,
+        open(scratch, "xb") as writer,
+    ):
         shared = False
         if sys.platform == "linux":
             with contextlib.suppress(OSError):
@@ -243,8 +247,6 @@ def copy(source: Path, target: Path) -> None:
                 shared = True
         if not shared:
             shutil.copyfileobj(reader, writer, 1 << 20)
-        writer.flush()
-        os.fsync(writer.fileno())
 
 
 # --- what is there -----------------------------------------------------------------------------------------------

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import TYPE_CHECKING
 from pyproj import Transformer
 
 from brmgeo.errors import CrsError, SettingsError, WorkflowError
-from brmgeo.files import told
+from brmgeo.files import told, whole_file
 from brmgeo.geo.crs import (
     LONLAT,
     belt_for_lon,
@@ -28,6 +26,7 @@ from brmgeo.geo.crs import (
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import sheet_extent, sheets_covering
 from brmgeo.region import Region, load_region
+from brmgeo.settings import build, read_toml
 
 if TYPE_CHECKING:
     from brmgeo.synth.scene import TownStyle
@@ -172,11 +171,9 @@ def new_region(
     )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as scratch:
-            draft = Path(scratch) / path.name
+        with whole_file(path) as draft:
             draft.write_text(text, encoding="utf-8")
-            load_region(draft)
-            os.replace(draft, path)
+            build(read_toml(draft), Region)
     except OSError as error:
         raise WorkflowError(f"{path} cannot be written: {told(error)} (--data)") from None
     return path

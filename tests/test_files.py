@@ -203,8 +203,13 @@ def test_digest_and_copy(tmp_path: Path) -> None:
     files.copy(source, tmp_path / "b")
     wanted = hashlib.sha256(b"abc" * 100_000).hexdigest()
     assert files.digest(tmp_path / "b") == files.digest_of(b"abc" * 100_000) == wanted
-    with pytest.raises(FileExistsError):
-        files.copy(source, tmp_path / "b")
+    files.write_text(source, "other")
+    files.copy(source, tmp_path / "b")
+    assert (tmp_path / "b").read_text() == "other"
+    with pytest.raises(FileNotFoundError):
+        files.copy(tmp_path / "no", tmp_path / "b")
+    assert (tmp_path / "b").read_text() == "other"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
 
 
 def test_a_lock_is_held_against_another_process(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import uuid
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -39,7 +37,8 @@ def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | 
     written = []
     with disk_errors(f"results in {out}", out):
         out.mkdir(parents=True, exist_ok=True)
-        files.clear_scratch(out, older_than_s=0.0)
+        for folder in {out, *((out / goal).parent for goal in wanted)}:
+            files.clear_scratch(folder, older_than_s=0.0)
         known = files.read_json(out / PUBLISHED)
         known = known if isinstance(known, dict) else {}
         before = dict(known)
@@ -47,13 +46,8 @@ def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | 
             for goal, (source, entry) in sorted(wanted.items()):
                 if goal in known and known[goal] == [entry["sha256"], *_look(out / goal)]:
                     continue
-                part = out / f"{files.SCRATCH}{uuid.uuid4().hex}"
-                try:
-                    files.copy(artifact.path / source, part)
-                    (out / goal).parent.mkdir(parents=True, exist_ok=True)
-                    os.replace(part, out / goal)
-                finally:
-                    part.unlink(missing_ok=True)
+                (out / goal).parent.mkdir(parents=True, exist_ok=True)
+                files.copy(artifact.path / source, out / goal)
                 known[goal] = [entry["sha256"], *_look(out / goal)]
                 written.append(goal)
             for goal in [g for g in known if g not in wanted and any(g.startswith(f"{r}/") for r in roots)]:
