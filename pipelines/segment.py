@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.export.cog import write_cog
 from brmgeo.files import write_bytes, write_json
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.locate.masks import frame_gsd_m, frame_picture, stored_of
 from brmgeo.pictures import SUFFIXES, encode
 from brmgeo.segment.predict import Answer, Gsd, Picture, Segmenter, mask_of, read_image
-from brmgeo.segment.raster import open_raster
 from brmgeo.workflow.progress import Progress
 
 SIGN = "masks.json"
@@ -169,6 +167,10 @@ def segment_raster(
 
     Raises SettingsError where the result may not stand at ``out``, else as ``open_raster``.
     """
+    # Here, for the masks of pictures need none of the libraries of maps.
+    from brmgeo.export.cog import write_cog
+    from brmgeo.segment.raster import open_raster
+
     if out.suffix.lower() not in (".tif", ".tiff"):
         raise SettingsError(f"--out {out}: a raster's mask is a GeoTIFF: give a name that ends in .tif")
     if out.exists() and out.samefile(raster):

@@ -16,25 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.evaluate.curves import crops_figure, reliability_figure, training_figure, training_table
 from brmgeo.extras import extra
 from brmgeo.files import write_bytes, write_json, write_text
 from brmgeo.region import load_region
 from brmgeo.segment.shards import TileSet, read_tiles
 from brmgeo.segment.weights import ModelCard, load_weights
 
-from . import training
-from .map_sources import credits
-from .regions import described_regions, region_named
-from .trainable import require_all_trainable, require_trainable
-
 with extra("train", "training a network"):
+    from brmgeo.evaluate.curves import crops_figure, reliability_figure, training_figure, training_table
     from brmgeo.segment import train as engine
     from brmgeo.segment.finish import finish
     from brmgeo.segment.ground import TrainingGround, gather
     from brmgeo.segment.imagenet import imagenet_weights
     from brmgeo.segment.metrics import LogitHistogram
     from brmgeo.segment.recipe import Recipe, SourceSpec, read_recipe
+
+    from . import training
+    from .map_sources import credits
+    from .regions import described_regions, region_named
+    from .trainable import require_all_trainable, require_trainable
 
 F32 = NDArray[np.float32]
 

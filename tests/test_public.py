@@ -7,10 +7,12 @@ import sys
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import brmgeo
-from brmgeo.extras import EXTRAS
+from brmgeo.extras import EXTRAS, extra, told
+from brmgeo.pictures import encode
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Imported first, it makes this process one without the extras.
@@ -51,13 +53,41 @@ def test_all_public_names_work_without_the_extras() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_not_installed_is_told_with_its_extra(tmp_path: Path) -> None:
-    command = f"import sys; sys.argv = ['brmgeo', 'maps', 'demo', '--data', {str(tmp_path)!r}]"
-    code = f"{BARE}{command}\nfrom brmgeo.__main__ import main\nmain()"
-    done = _python(code)
+def _bare_command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command line of an installation without the extras."""
+    argv = ["brmgeo", *arguments]
+    return _python(f"{BARE}sys.argv = {argv!r}\nfrom brmgeo.__main__ import main\nmain()")
+
+
+@pytest.mark.parametrize(
+    ("command", "extra"), [(("maps", "demo"), "maps"), (("train", "data/recipes/short.toml"), "train")]
+)
+def test_what_is_not_installed_is_told_with_its_extra(
+    tmp_path: Path, command: tuple[str, ...], extra: str
+) -> None:
+    done = _bare_command(*command, "--data", str(tmp_path))
+    assert done.returncode == 2, done.stderr
+    assert f"pip install 'brmgeo[{extra}]'" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_masks_of_pictures_need_no_extra_and_those_of_a_raster_name_theirs(tmp_path: Path) -> None:
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    (frames / "a.png").write_bytes(encode(np.full((40, 48, 3), 90, np.uint8)))
+    done = _bare_command("segment", str(frames), "--out", str(tmp_path / "masks"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "masks" / "a.png").is_file()
+    done = _bare_command("segment", str(frames / "a.png"), "--out", str(tmp_path / "mask.tif"))
     assert done.returncode == 2, done.stderr
     assert "pip install 'brmgeo[maps]'" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_library_of_no_extra_is_no_matter_of_extras() -> None:
+    with pytest.raises(ModuleNotFoundError, match="torch"), extra("logs", "reading logs"):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+    assert told(ModuleNotFoundError("No module named 'odd'", name="odd"), "this") is None
 
 
 @pytest.fixture(scope="module")
