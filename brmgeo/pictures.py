@@ -1,9 +1,10 @@
-"""Pictures from files: decoded whole, or told what is wrong with them."""
+"""Pictures from files: decoded whole, or told what is wrong with them; their bands, palettes and levels as 8-bit RGB."""
 
 from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +81,70 @@ def encode(image: NDArray[np.uint8], suffix: str = ".png", *, quality: int = 95)
     if not done:
         raise ValueError(f"a picture of {image.shape} {image.dtype} cannot be written as {suffix}")
     return data.tobytes()
+
+
+# --- as 8-bit RGB ------------------------------------------------------------------------------------------------
+
+
+def rgb_of(image: NDArray[np.uint8], name: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """(h, w, 3) RGB of (h, w) or (h, w, 1 to 4), and (h, w) bool, False where it is transparent; None: nowhere.
+
+    Grey is repeated in the three channels; a second or fourth channel is alpha, and 0 there is transparent. Raises
+    InputError, with ``name``, for other shapes.
+    """
+    if image.ndim == 2:
+        image = image[:, :, None]
+    if image.ndim != 3 or image.shape[2] not in (1, 2, 3, 4):
+        raise InputError(
+            f"{name}: an array of {image.shape}; give rows x columns x 1 to 4 channels (grey or RGB, with alpha or without)"
+        )
+    channels = image.shape[2]
+    known = image[:, :, -1] > 0 if channels in (2, 4) else None
+    rgb = np.repeat(image[:, :, :1], 3, axis=2) if channels < 3 else image[:, :, :3]
+    return np.ascontiguousarray(rgb), None if known is None or known.all() else known
+
+
+def scaled_levels(values: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
+    """``low`` to ``high`` of any numbers as 0 to 255, cut off at the ends, halves upwards; NaN becomes 0."""
+    levels = np.nan_to_num((values.astype(np.float64) - low) * (255.0 / (high - low)))
+    return np.floor(np.clip(levels, 0.0, 255.0) + 0.5).astype(np.uint8)
+
+
+def colour_bands(raster: Any, path: Path, stated: Sequence[int] | None = None) -> tuple[int, ...]:
+    """The bands (from 1) of a raster opened by rasterio that are red, green and blue, or the one that is grey.
+
+    They are the ``stated`` ones; else those that the file labels; else its first three, or its first, that are not alpha.
+    Raises InputError for bands that are not there, and where two bands do not say which is which.
+    """
+    if stated is not None:
+        told = ",".join(map(str, stated))
+        if not set(stated) <= set(raster.indexes):
+            raise InputError(f"bands {told}: {path} has bands 1 to {raster.count}", needs="bands")
+        if len(stated) not in (1, 3):
+            raise InputError(f"bands {told}: state one band of {path}, or three", needs="bands")
+        return tuple(stated)
+    kinds = [kind.name for kind in raster.colorinterp]
+    if {"red", "green", "blue"} <= set(kinds):
+        return tuple(kinds.index(colour) + 1 for colour in ("red", "green", "blue"))
+    colours = [band for band, kind in enumerate(kinds, start=1) if kind != "alpha"]
+    if len(colours) == 2:
+        raise InputError(
+            f"{path} has two bands: state bands, which are red, green and blue, or which one is grey, such as 1",
+            needs="bands",
+        )
+    return tuple(colours[:3] if len(colours) > 2 else colours or [1])
+
+
+def palette_of(raster: Any, path: Path, bands: Sequence[int]) -> NDArray[np.uint8] | None:
+    """(256, 4) RGBA of each value of the one band of a raster opened by rasterio; None where it has no palette.
+
+    Raises InputError for a palette of more than 256 colours.
+    """
+    if len(bands) != 1 or raster.colorinterp[bands[0] - 1].name != "palette":
+        return None
+    if (kind := raster.dtypes[bands[0] - 1]) != "uint8":
+        raise InputError(
+            f"{path}: a palette of {kind} values: expand it to RGB first (gdal_translate -expand rgb)"
+        )
+    table = raster.colormap(bands[0])
+    return np.array([table.get(value, (0, 0, 0, 0)) for value in range(256)], dtype=np.uint8)

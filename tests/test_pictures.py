@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rasterio.enums import ColorInterp
 
 from brmgeo import pictures
 from brmgeo.errors import InputError, MissingInputError
@@ -41,3 +42,81 @@ def test_what_is_cut_short_is_told(suffix: str) -> None:
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError):
         pictures.read_bytes(tmp_path / "gone.png")
+
+
+def test_grey_and_transparent_pictures_as_rgb() -> None:
+    grey = _picture()[:, :, 0]
+    rgb, known = pictures.rgb_of(grey, "a")
+    assert known is None
+    assert (rgb == grey[:, :, None]).all()
+    alpha = np.where(np.arange(60) < 20, 0, 9).astype(np.uint8) + np.zeros((40, 1), np.uint8)
+    for image in (np.dstack([_picture(), alpha]), np.dstack([grey, alpha])):
+        rgb, known = pictures.rgb_of(image, "a")
+        assert rgb.shape == (40, 60, 3)
+        assert known is not None
+        assert (known == (alpha > 0)).all()
+    with pytest.raises(InputError, match="a: an array of"):
+        pictures.rgb_of(np.zeros((4, 4, 5), np.uint8), "a")
+
+
+def test_levels_are_cut_off_and_rounded() -> None:
+    values = np.array([-5.0, 0.0, 1.0, 3.0, 510.0, 9e9, np.inf, np.nan], np.float32)
+    assert pictures.scaled_levels(values, 0, 510).tolist() == [0, 0, 1, 2, 255, 255, 255, 0]
+
+
+class _Raster:
+    """What is asked of a raster that rasterio opened."""
+
+    def __init__(self, *kinds: ColorInterp, dtype: str = "uint8") -> None:
+        self.colorinterp, self.count = kinds, len(kinds)
+        self.indexes, self.dtypes = tuple(range(1, self.count + 1)), (dtype,) * self.count
+
+    def colormap(self, band: int) -> dict[int, tuple[int, int, int, int]]:
+        return {band: (1, 2, 3, 255), 400: (9, 9, 9, 255)}
+
+
+C = ColorInterp
+
+
+@pytest.mark.parametrize(
+    ("kinds", "stated", "bands"),
+    [
+        ((C.blue, C.green, C.red, C.alpha), None, (3, 2, 1)),
+        ((C.undefined, C.red, C.green, C.blue), None, (2, 3, 4)),
+        ((C.gray, C.undefined, C.undefined, C.undefined), None, (1, 2, 3)),
+        ((C.alpha, C.gray), None, (2,)),
+        ((C.gray,), None, (1,)),
+        ((C.alpha,), None, (1,)),
+        ((C.gray, C.undefined), (2,), (2,)),
+        ((C.red, C.green, C.blue), (3, 2, 1), (3, 2, 1)),
+    ],
+)
+def test_bands_of_colour(
+    kinds: tuple[C, ...], stated: tuple[int, ...] | None, bands: tuple[int, ...]
+) -> None:
+    assert pictures.colour_bands(_Raster(*kinds), Path("a.tif"), stated) == bands
+
+
+@pytest.mark.parametrize(
+    ("kinds", "stated"),
+    [
+        ((C.gray, C.undefined), None),
+        ((C.gray, C.undefined, C.alpha), None),
+        ((C.red, C.green, C.blue), (1, 2)),
+        ((C.red, C.green, C.blue), (0,)),
+    ],
+)
+def test_bands_that_nobody_can_tell_are_refused(kinds: tuple[C, ...], stated: tuple[int, ...] | None) -> None:
+    with pytest.raises(InputError, match=r"a\.tif") as caught:
+        pictures.colour_bands(_Raster(*kinds), Path("a.tif"), stated)
+    assert caught.value.needs == "bands"
+
+
+def test_a_palette_is_a_table_of_256_colours() -> None:
+    table = pictures.palette_of(_Raster(C.palette), Path("a.tif"), (1,))
+    assert table is not None
+    assert table.shape == (256, 4)
+    assert table[:2].tolist() == [[0, 0, 0, 0], [1, 2, 3, 255]]
+    assert pictures.palette_of(_Raster(C.gray), Path("a.tif"), (1,)) is None
+    with pytest.raises(InputError, match=r"a\.tif: a palette of uint16"):
+        pictures.palette_of(_Raster(C.palette, dtype="uint16"), Path("a.tif"), (1,))

@@ -33,7 +33,6 @@ from numba import njit
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from rasterio._err import CPLE_BaseError
-from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
@@ -42,6 +41,7 @@ from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import Tile
 from brmgeo.ingest.tiles import TileSource
+from brmgeo.pictures import colour_bands, palette_of, scaled_levels
 
 _CELL_PX = 32
 # The largest piece of a source that is held at once, pixels a side.
@@ -225,15 +225,12 @@ class _FilePlane:
         self.affine = affine
         self.width, self.height = int(src.width), int(src.height)
         self.bands = _colour_bands(src, source)
-        self.palette = None
-        if src.colorinterp[0] == ColorInterp.palette:
-            table = src.colormap(1)
-            self.palette = np.array([table.get(i, (0, 0, 0, 0)) for i in range(256)], dtype=np.uint8)
+        self.palette = palette_of(src, source.path, self.bands)
 
     def read(self, window: Window) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         target = rasterio.windows.Window(window.col, window.row, window.width, window.height)
         try:
-            values = self.src.read(self.bands, window=target)
+            values = self.src.read(list(self.bands), window=target)
             valid = self.src.dataset_mask(window=target) > 0
         except (RasterioError, CPLE_BaseError) as error:
             raise InputError(
@@ -245,8 +242,7 @@ class _FilePlane:
         if self.source.value_range is not None:
             low, high = self.source.value_range
             bad = ~np.isfinite(values).all(axis=0) if values.dtype.kind == "f" else np.zeros_like(valid)
-            scaled = (np.nan_to_num(values.astype(np.float64)) - low) * (255.0 / (high - low))
-            values, valid = np.floor(np.clip(scaled, 0.0, 255.0) + 0.5).astype(np.uint8), valid & ~bad
+            values, valid = scaled_levels(values, low, high), valid & ~bad
         image = np.moveaxis(values, 0, -1)
         return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3))), valid
 
@@ -333,29 +329,9 @@ def _ortho_place(source: NgiiOrtho, src: Any, placed: bool) -> tuple[str, Affine
     return crs, Affine(gx, 0.0, left, 0.0, -gy, top)
 
 
-def _colour_bands(src: Any, source: GeoRaster | NgiiOrtho) -> list[int]:
+def _colour_bands(src: Any, source: GeoRaster | NgiiOrtho) -> tuple[int, ...]:
     """Bands to read as grey or red, green, blue."""
-    wanted = source.bands if isinstance(source, GeoRaster) else None
-    if wanted is not None:
-        bands = list(wanted)
-        if len(bands) not in (1, 3) or not set(bands) <= set(src.indexes):
-            raise InputError(f"{source.path} has bands 1 to {src.count}: state 1 or 3 of them, not {bands}")
-    else:
-        named = [
-            next((i for i, c in zip(src.indexes, src.colorinterp) if c == colour), 0)
-            for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-        ]
-        colours = [i for i, c in zip(src.indexes, src.colorinterp) if c != ColorInterp.alpha]
-        if all(named):
-            bands = named
-        elif len(colours) >= 3:
-            bands = colours[:3]
-        elif len(colours) == 2:
-            raise InputError(
-                f"{source.path} has two bands: state which are red, green and blue, or grey (bands = [1])"
-            )
-        else:
-            bands = colours[:1] or [1]
+    bands = colour_bands(src, source.path, source.bands if isinstance(source, GeoRaster) else None)
     low_high = source.value_range
     if low_high is not None and not low_high[1] > low_high[0]:
         raise InputError(f"{source.path}: value_range {low_high} is empty: give (black, white)")

@@ -35,12 +35,8 @@ def read_pair(image_path: Path, mask_path: Path) -> tuple[NDArray[np.uint8], NDA
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """(h, w, 3) uint8 RGB and (h, w) bool, False where it is transparent; InputError for what is no 8-bit picture."""
     found = _decoded(path)
-    if found.ndim == 2:
-        found = np.repeat(found[..., None], 3, axis=2)
-    if found.shape[-1] not in (3, 4):
-        raise InputError(f"{path}: has {found.shape[-1]} bands; give grey, RGB or RGBA pictures")
-    seen = found[..., 3] > 0 if found.shape[-1] == 4 else np.ones(found.shape[:2], np.bool_)
-    rgb = np.ascontiguousarray(found[..., :3])
+    rgb, known = pictures.rgb_of(found, str(path))
+    seen = np.ones(rgb.shape[:2], np.bool_) if known is None else known
     rgb[~seen] = 0
     return rgb, seen
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.pictures import decode, read_bytes
+from brmgeo.pictures import decode, read_bytes, rgb_of, scaled_levels
 from brmgeo.segment.weights import ModelCard
 
 Backend = Literal["onnx", "torch"]
@@ -56,10 +56,9 @@ class Picture:
 
 
 def picture_of(image: NDArray[Any], name: str = "the image") -> Picture:
-    """An image array as RGB.
+    """An image array as RGB, as ``rgb_of``: unknown where transparent.
 
-    Grey (h, w) or (h, w, 1) is repeated in the three channels; a second or fourth channel is alpha, and 0 there means
-    unknown. Raises InputError for more than 8 bits a channel (which of the levels are black and white nobody can
+    Raises InputError for more than 8 bits a channel (which of the levels are black and white nobody can
     tell from the picture: scale it first), other shapes, and pictures under 16 pixels on a side.
     """
     if image.dtype != np.uint8:
@@ -68,27 +67,11 @@ def picture_of(image: NDArray[Any], name: str = "the image") -> Picture:
             "convert it first (gdal_translate -ot Byte -scale LOW HIGH)",
             needs="levels",
         )
-    if image.ndim == 2:
-        image = image[:, :, None]
-    if image.ndim != 3 or image.shape[2] not in (1, 2, 3, 4):
-        raise InputError(
-            f"{name}: an array of {image.shape}; give rows x columns x 1 to 4 channels (grey or RGB, with alpha or without)"
-        )
-    h, w, channels = image.shape
+    rgb, known = rgb_of(image, name)
+    h, w = rgb.shape[:2]
     if min(h, w) < MIN_PX:
         raise InputError(f"{name}: {w} x {h} px is too small: give at least {MIN_PX} px on each side")
-    known = image[:, :, -1] > 0 if channels in (2, 4) else None
-    if known is not None and known.all():
-        known = None
-    rgb = np.repeat(image[:, :, :1], 3, axis=2) if channels < 3 else image[:, :, :3]
-    return Picture(np.ascontiguousarray(rgb), known)
-
-
-def scaled_levels(image: NDArray[Any], low: float, high: float) -> U8:
-    """``low`` to ``high`` of any numbers as 0 to 255, cut off at the ends; NaN becomes 0."""
-    share = (image.astype(np.float32) - np.float32(low)) / np.float32(high - low)
-    out: U8 = np.rint(np.clip(np.nan_to_num(share), 0.0, 1.0) * 255.0).astype(np.uint8)
-    return out
+    return Picture(rgb, known)
 
 
 def read_image(path: Path, data: bytes | None = None, levels: tuple[float, float] | None = None) -> Picture:

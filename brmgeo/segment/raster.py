@@ -21,9 +21,10 @@ from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
-from brmgeo.errors import InputError, SettingsError, one_line
+from brmgeo.errors import InputError, one_line
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.geo.grid import Window
+from brmgeo.pictures import colour_bands, palette_of, scaled_levels
 from brmgeo.segment.predict import (
     MIN_PX,
     OVERLAP_PX,
@@ -33,7 +34,6 @@ from brmgeo.segment.predict import (
     Segmenter,
     mask_of,
     picture_of,
-    scaled_levels,
     spans,
 )
 
@@ -74,8 +74,8 @@ class RasterReader:
                 f"{path}: no georeferencing beside the CRS: its corner and pixel size are not stated"
             )
         self._src, self._path, self._levels, self._segmenter = src, path, levels, segmenter
-        self._bands = rgb_bands(src, path, bands)
-        self._palette = palette_of(src, self._bands)
+        self._bands = colour_bands(src, path, bands)
+        self._palette = palette_of(src, path, self._bands)
         if (
             self._palette is None
             and levels is None
@@ -130,7 +130,7 @@ class RasterReader:
             )
         image = np.moveaxis(seen, 0, -1)
         if self._palette is not None:
-            image = self._palette[image[:, :, 0]]
+            image = self._palette[image[:, :, 0], :3]
         elif self._levels is not None:
             image = scaled_levels(image, *self._levels)
         return Picture(picture_of(image, str(self._path)).rgb, None if known.all() else known)
@@ -206,8 +206,8 @@ def open_raster(
         levels: the levels that are black and white in a raster of more than 8 bits.
         bands: its red, green and blue band, or its grey one, counted from 1; None: as the file says.
 
-    Raises InputError for files that are no readable raster, have no place, are too coarse or too small, or have more than 8
-    bits where ``levels`` is not given; SettingsError for bands that are not there or must be stated.
+    Raises InputError for files that are no readable raster, have no place, are too coarse or too small, have more than 8
+    bits where ``levels`` is not given, and for bands that are not there or must be stated.
     """
     try:
         with warnings.catch_warnings():
@@ -224,39 +224,6 @@ def codes_of(probability: NDArray[np.float32], threshold: float) -> NDArray[np.u
     """(h, w) uint8 of the maps' codes: building above ``threshold``, unknown where NaN, other elsewhere."""
     building = mask_of(probability, threshold) > 0
     return np.where(np.isnan(probability), UNKNOWN, np.where(building, BUILDING, OTHER)).astype(np.uint8)
-
-
-def rgb_bands(src: Any, path: Path, bands: tuple[int, ...] | None) -> tuple[int, ...]:
-    """The bands of an open raster that are red, green and blue, or the one that is grey; ``bands`` where given.
-
-    Raises SettingsError for bands that are not there, and where two bands do not say which is which.
-    """
-    if bands is not None:
-        if any(not 1 <= b <= src.count for b in bands):
-            raise SettingsError(
-                f"bands {','.join(map(str, bands))}: {path} has bands 1 to {src.count}", needs="bands"
-            )
-        return bands
-    kinds = rasterio.enums.ColorInterp
-    named = {kind: band for band, kind in reversed(list(enumerate(src.colorinterp, start=1)))}
-    if all(kind in named for kind in (kinds.red, kinds.green, kinds.blue)):
-        return named[kinds.red], named[kinds.green], named[kinds.blue]
-    if src.count == 2 and kinds.alpha not in named:
-        raise SettingsError(
-            f"{path} has two bands: say which are red, green and blue, or grey, such as 1", needs="bands"
-        )
-    return (1, 2, 3) if src.count >= 3 else (1,)
-
-
-def palette_of(src: Any, bands: tuple[int, ...]) -> NDArray[np.uint8] | None:
-    """(256, 3) uint8 RGB of each value of an open raster's one band; None where it has no palette."""
-    if len(bands) != 1 or src.colorinterp[bands[0] - 1] != rasterio.enums.ColorInterp.palette:
-        return None
-    table = np.zeros((256, 3), np.uint8)
-    for value, colour in src.colormap(bands[0]).items():
-        if 0 <= value < 256:
-            table[value] = colour[:3]
-    return table
 
 
 def ground_gsd_m(src: Any, path: Path) -> tuple[float, float]:
