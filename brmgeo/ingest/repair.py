@@ -282,7 +282,7 @@ def _first_of_equals(
 def _with_courtyards(polygons: Objects, layers: Objects) -> tuple[Objects, NDArray[np.bool_]]:
     """Polygons with the rings inside them as holes, and which of the given ones became holes.
 
-    ClosedOutlines are nested to any depth: a ring at odd depth is a courtyard, at even depth a building (in a courtyard).
+    Rings are nested to any depth: a ring at odd depth is a courtyard, at even depth a building (in a courtyard).
     A ring that shares a stretch of wall with the one around it is not a courtyard.
     """
     outer, inner = shapely.STRtree(polygons).query(polygons)

@@ -1,6 +1,6 @@
 """The end of a training run: calibration, scores, the model card, and the files that are written.
 
-MaskScores are taken as prediction would answer: at the frames' own GSD, by the weights and looks that are kept.
+Scores are taken as prediction would answer: at the frames' own GSD, by the weights and looks that are kept.
 """
 
 from __future__ import annotations

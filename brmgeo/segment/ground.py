@@ -116,7 +116,7 @@ def xyz_scenes(folder: Path, zoom: int, validation_share: float) -> tuple[list[S
         raise InputError(
             f"{folder}: no image is named ...X-Y-{zoom}: those are the tiles of zoom level {zoom}"
         )
-    # TrainingGround metres: web-mercator's pixel shrinks with the cosine of the latitude.
+    # Ground metres: web-mercator's pixel shrinks with the cosine of the latitude.
     y = sum(k[1] for k in tiles) / len(tiles)
     latitude = math.atan(math.sinh(math.pi * (1 - 2 * (y + 0.5) / 2**zoom)))
     shapes = sorted({label.shape for _, label in tiles.values()})
