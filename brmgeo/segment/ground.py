@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from brmgeo.codes import LABEL_BUILDING as BUILDING
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
@@ -139,18 +141,19 @@ def xyz_scenes(folder: Path, zoom: int, validation_share: float) -> tuple[list[S
 
 
 def _touching(keys: set[tuple[int, int]]) -> list[set[tuple[int, int]]]:
-    groups = []
-    left = set(keys)
-    while left:
-        todo, group = [left.pop()], set[tuple[int, int]]()
-        while todo:
-            x, y = todo.pop()
-            group.add((x, y))
-            near = {(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)} & left
-            left -= near
-            todo += near
-        groups.append(group)
-    return groups
+    """The tiles (x, y) in groups, each of those that are joined side by side."""
+    places = sorted(keys)
+    number = {place: i for i, place in enumerate(places)}
+    beside = [
+        (i, number[near])
+        for (x, y), i in number.items()
+        for near in ((x + 1, y), (x, y + 1))
+        if near in number
+    ]
+    a, b = np.array(beside, np.int64).reshape(-1, 2).T
+    pairs = coo_array((np.ones(len(a), np.bool_), (a, b)), shape=(len(places), len(places)))
+    count, group = connected_components(pairs, directed=False)
+    return [{places[i] for i in np.flatnonzero(group == k)} for k in range(count)]
 
 
 def _assembled(
