@@ -99,7 +99,8 @@ def read_row(path: Path) -> FlightRow:
         )
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path} is not a metrics.json of brmgeo localize ({error!r}); run localize again"
+            f"{path}: not the metrics.json of a located flight, or of another version of brmgeo ({error!r}): locate the "
+            "flight again"
         ) from None
 
 

@@ -637,7 +637,7 @@ def _covariance(path: Path, odometry: Odometry) -> Odometry:
             None,
             None,
             f"{len(times)} rows that do not belong to the {len(odometry.t_s)} poses of {odometry.source}: "
-            "run brmgeo odometry again, or remove 'covariance' from [odometry]",
+            "make both together, or remove 'covariance' from [odometry]",
         )
     walk = table.numbers["walk_m2"]
     falling = np.flatnonzero(np.diff(walk, prepend=0.0) < 0.0)

@@ -105,5 +105,5 @@ def test_a_row_is_read_back_from_the_metrics_of_a_flight(tmp_path: Path) -> None
     path.write_text(json.dumps(old | {"seconds_per_frame": 0.25, "flight": "f", "method": "mask"}))
     assert read_row(path).scores == BASE
     path.write_text("[1, 2]")
-    with pytest.raises(InputError, match=r"metrics\.json is not a metrics\.json of brmgeo localize"):
+    with pytest.raises(InputError, match=r"metrics\.json: not the metrics\.json of a located flight"):
         read_row(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import errno
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,15 +62,25 @@ def test_every_need_of_the_library_is_a_parameter_of_some_command() -> None:
 
 def test_the_library_names_no_option_and_no_command() -> None:
     """What to type is said by the command line alone: the library is also called by programs."""
+    commands = "|".join(map(re.escape, cli.commands))
+    mark = re.compile(
+        rf"(?<![\w-])--\w|`make |\(make |`brmgeo|\brun brmgeo\b|\bbrmgeo ({commands})\b|\brun ({commands}) again\b"
+    )
     named = []
     for path in sorted((ROOT / "brmgeo").rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
-            if not isinstance(node, ast.Raise) or node.exc is None:
-                continue
-            for text in ast.walk(node.exc):
-                if isinstance(text, ast.Constant) and isinstance(text.value, str):
-                    words = text.value
-                    if any(mark in words for mark in (" --", "(--", "`brmgeo", "`make ", "(make ", "'--")):
-                        named.append(f"{path.relative_to(ROOT)}:{text.lineno}: {words}")
+            if isinstance(node, ast.Raise) and node.exc is not None:
+                named += [f"{path.relative_to(ROOT)}: {text}" for text in _texts(node.exc) if mark.search(text)]
     assert named == []
+
+
+def _texts(tree: ast.AST) -> list[str]:
+    """The strings of an expression, each whole: an f-string with braces for its values."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            found.append("".join(str(v.value) if isinstance(v, ast.Constant) else "{}" for v in node.values))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found.append(node.value)
+    return found
