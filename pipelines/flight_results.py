@@ -71,6 +71,8 @@ class FlightResults:
         masks: of its frames.
         method, settings: of the matcher.
         compass: its compass was trusted.
+        odometry: ``auto`` or ``given``: whether a flight without odometry might get its own.
+        interval_s: between the frames that are kept of a video then.
         located: what the matcher said.
         truth: (n, 2) where each frame was taken, NaN where unknown; None without a reference. For scores only.
         sift: match the frames to the imagery too.
@@ -82,6 +84,8 @@ class FlightResults:
     method: str
     settings: MatchSettings
     compass: bool
+    odometry: str
+    interval_s: float
     located: Located
     truth: FloatArray | None
     sift: bool
@@ -114,7 +118,13 @@ class FlightResults:
     def names(self) -> dict[str, Any]:
         """What metrics.json says beside the scores: enough to make the result again."""
         values = asdict(self.settings)
-        used = {"compass": self.compass, "roof_m": self.masks.roof_m}
+        used = {
+            "compass": self.compass,
+            "roof_m": self.masks.roof_m,
+            "network": self.masks.network,
+            "odometry": self.odometry,
+            "interval_s": self.interval_s,
+        }
         return {
             "flight": self.flight.name,
             "data": self.source,
@@ -308,7 +318,3 @@ def _background(path: Path) -> Background:
 def _duration(times: FloatArray) -> str:
     seconds = float(times[-1] - times[0]) if len(times) else 0.0
     return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
-
-
-def _safe(text: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "-" for c in text).strip(".-") or "flight"

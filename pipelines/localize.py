@@ -85,6 +85,8 @@ def localize(
             method=method,
             settings=settings,
             compass=compass,
+            odometry=odometry,
+            interval_s=own.interval_s,
             located=located,
             truth=None if reference is None else reference.at(flight.times_s),
             sift=sift,

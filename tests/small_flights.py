@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from brmgeo.synth.flight import MaskErrors, OdometryErrors, SimulationSettings
 from pipelines.cli import cli, run
 
 CRS, LEFT, TOP, GSD, ROWS, COLS = "EPSG:5187", 195_000.0, 446_000.0, 0.5, 1000, 1200
@@ -34,6 +35,14 @@ def make_flight(maps: Path, waypoints: Path, out: Path, *words: object) -> Path:
     given = ["simulate", "--maps", maps, "--out", out, "--path", waypoints, "--mode", "masks", *words]
     assert run(lambda: cli([str(w) for w in given], standalone_mode=False)) == 0
     return out
+
+
+def exact(settings: SimulationSettings) -> SimulationSettings:
+    """The same flight with perfect instruments and masks."""
+    odometry = None if settings.odometry is None else OdometryErrors.none()
+    return replace(
+        settings, attitude_error_deg=0.0, agl_error_m=0.0, masks=MaskErrors.none(), odometry=odometry
+    )
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:

@@ -88,11 +88,6 @@ class Flight:
         """(n,) float64 times of the frames."""
         return np.array([frame.t_s for frame in self.frames])
 
-    @property
-    def has_reference(self) -> bool:
-        """True when there is a reference to score against."""
-        return self._reference is not None
-
     def image(self, index: int) -> NDArray[np.uint8]:
         """(height, width, 3) uint8 RGB of a frame; FlightError when it cannot be decoded or has another size."""
         frame = self.frames[index]

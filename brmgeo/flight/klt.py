@@ -10,7 +10,6 @@ frame to frame adds an error every time, and at ten frames a second most of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.flight.readings import FloatArray
-
-Prediction = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)

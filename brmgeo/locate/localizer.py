@@ -22,7 +22,7 @@ from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
 from brmgeo.locate.maps import Maps
-from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_image, stored_of
+from brmgeo.locate.masks import ROOF_M, above_roofs_m, known_by, network_image, stored_of
 from brmgeo.locate.saved import differs, read_saved, settings_of, write_saved
 from brmgeo.match import MatchSettings, SmoothedPath, make_matcher
 from brmgeo.match.state import under, within
@@ -272,10 +272,7 @@ class Localizer:
 
 
 def _network(masks: Segmenter | None) -> dict[str, Any]:
-    """What a network is known by, and how it is asked."""
-    if masks is None:
-        return {"weights": None, "backend": None, "looks": None}
-    return {"weights": masks.card.sha256, "backend": masks.backend, "looks": masks.looks}
+    return dict.fromkeys(("weights", "backend", "looks")) if masks is None else known_by(masks)
 
 
 def _checked_mask(mask: NDArray[Any], name: str) -> NDArray[Any]:

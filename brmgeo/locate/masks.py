@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +65,7 @@ class FrameMasks:
         files: the network's probability of each frame; None for the flight's own masks.
         threshold: probabilities above it are building; None hands probabilities on as they are.
         roof_m: what the masks show as building stands this high above ground; 0 for outlines on the ground.
+        network: what the network is known by (``known_by``) and its ``answer``; None for the flight's own masks.
     """
 
     flight: Flight
@@ -72,6 +73,7 @@ class FrameMasks:
     files: tuple[Path, ...] | None = None
     threshold: float | None = None
     roof_m: float = 0.0
+    network: Mapping[str, Any] | None = None
 
     def agl_m(self, index: int) -> float:
         """Height of a frame above what its mask shows, metres."""
@@ -141,7 +143,17 @@ def frame_masks(
         runs = {"onnx": "ONNX Runtime", "torch": "torch"}[segmenter.backend]
         shown = "probabilities" if threshold is None else f"masks above {threshold:g}"
         source = f"network {segmenter.name} ({runs}), {shown}, roofs at {use.roof_m:g} m"
-        yield FrameMasks(flight, source, files, threshold, use.roof_m)
+        network = known_by(segmenter) | {"answer": use.answer}
+        yield FrameMasks(flight, source, files, threshold, use.roof_m, network)
+
+
+def known_by(segmenter: Segmenter) -> dict[str, Any]:
+    """What tells a network's answers from another's: the digest of its weights, what runs it, and how often it looks."""
+    return {
+        "weights": segmenter.card.sha256,
+        "backend": segmenter.backend,
+        "looks": segmenter.looks,
+    }
 
 
 def above_roofs_m(agl_m: float, roof_m: float) -> float:
@@ -257,13 +269,8 @@ def _ask(flight: Flight, segmenter: Segmenter, cache: Path, watch: Watch) -> tup
 
 def _key(data: bytes, segmenter: Segmenter, picture: Picture, gsd_m: float) -> Path:
     size = segmenter.working_size((picture.rgb.shape[0], picture.rgb.shape[1]), gsd_m)
-    settings = {
-        "format": _FORMAT,
-        "weights": segmenter.card.sha256,
-        "backend": segmenter.backend,
-        "looks": segmenter.looks,
-    }
-    text = json.dumps({**settings, "frame": digest_of(data), "size": size}, sort_keys=True)
+    asked = {"format": _FORMAT, **known_by(segmenter), "frame": digest_of(data), "size": size}
+    text = json.dumps(asked, sort_keys=True)
     key = digest_of(text)
     return Path(key[:2]) / f"{key[2:40]}.png"
 

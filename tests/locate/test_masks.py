@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
+from small_flights import exact
 from small_networks import bright_onnx, small_card
 
 from brmgeo.flight.folder import read_flight
@@ -113,7 +114,7 @@ def test_roofs_are_laid_where_their_outlines_are_on_the_ground() -> None:
         for (x, y), (w, h) in zip(at, rng.uniform(6, 16, (64, 2)), strict=True)
     ]
     ground = RaisedFootprints.from_polygons(boxes, [6.0] * len(boxes))
-    own = Simulated(mount=Attitude(pitch_rad=math.radians(-15)), agl_m=100.0, agl_sigma_m=0.0).exact()
+    own = exact(Simulated(mount=Attitude(pitch_rad=math.radians(-15)), agl_m=100.0, agl_sigma_m=0.0))
     path = np.array([[60.0, 100.0], [120.0, 100.0]])
     simulator = Simulator(ground, own, fly(path, own, 1), 1)
     pose = simulator.course

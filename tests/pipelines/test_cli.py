@@ -71,7 +71,9 @@ def test_the_library_names_no_option_and_no_command() -> None:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Raise) and node.exc is not None:
-                named += [f"{path.relative_to(ROOT)}: {text}" for text in _texts(node.exc) if mark.search(text)]
+                named += [
+                    f"{path.relative_to(ROOT)}: {text}" for text in _texts(node.exc) if mark.search(text)
+                ]
     assert named == []
 
 

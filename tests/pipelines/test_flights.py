@@ -232,7 +232,13 @@ def test_metrics_hold_all_settings_that_a_method_reads(
     groups = {f.name: getattr(own, f.name) for f in fields(own)}
     locate_flight(read_maps(maps), flight, FrameMasks(flight, ""), method=method, settings=Watched(**groups))
     written = json.loads((results / method / "metrics.json").read_text())["settings"]
-    assert written.pop("localize") == {"compass": False, "roof_m": 0.0}
+    assert written.pop("localize") == {
+        "compass": False,
+        "roof_m": 0.0,
+        "network": None,
+        "odometry": "auto",
+        "interval_s": FlightSettings().interval_s,
+    }
     assert set(written) == read & set(groups)
     for name, values in written.items():
         assert values == asdict(groups[name]), "nothing is rounded: a result can be repeated"

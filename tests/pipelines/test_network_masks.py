@@ -48,6 +48,9 @@ def test_localize_runs_the_network_where_there_are_no_masks(
     assert bytes_of(pictured) == before
     metrics = json.loads((tmp_path / "a/metrics.json").read_text())
     assert metrics["masks"].startswith("network bright abababababab (ONNX Runtime), ")
+    assert metrics["settings"]["localize"]["network"] == {
+        "weights": "ab" * 32, "backend": "onnx", "looks": 1, "answer": "mask"
+    }  # fmt: skip
     assert metrics["data"] == "simulated"
     assert metrics["false_fixes"] == 0
     assert metrics["rmse_after_first_fix_m"] < 5

@@ -120,8 +120,11 @@ def test_from_simulated_frames_to_a_report_with_no_odometry_given(
     assert made["odometry"].startswith("made from the frames")
     assert made["odometry_rmse_m"] < 2.0
     assert made["odometry"] in (tmp_path / "own" / "report.html").read_text()
+    assert made["settings"]["localize"]["odometry"] == "auto"
 
     said = brmgeo(capsys, *words, "--odometry", "given", "--out", tmp_path / "none")
     assert said.status == 0, said.err
     assert "made from the frames" not in said.err
-    assert json.loads((tmp_path / "none" / "metrics.json").read_text())["odometry"] == "none"
+    none = json.loads((tmp_path / "none" / "metrics.json").read_text())
+    assert none["odometry"] == "none"
+    assert none["settings"]["localize"]["odometry"] == "given"

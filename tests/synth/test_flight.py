@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from small_flights import exact
 
 from brmgeo.errors import InputError
 from brmgeo.flight.camera import pixel_from_point, world_from_camera
@@ -93,7 +94,7 @@ def overlap(view: View, xy: np.ndarray, yaw: float) -> float:
     ids=["nadir", "tilted and distorted"],
 )
 def test_true_poses_lay_views_onto_the_map(settings: SimulationSettings) -> None:
-    flight = simulate_views(GROUND, PATH, settings.exact(), seed=1)
+    flight = simulate_views(GROUND, PATH, exact(settings), seed=1)
     assert len(flight.views) == 8
     for view, xy, yaw in zip(flight.views, flight.reference.xy_m, flight.yaw_rad):
         assert overlap(view, xy, float(yaw)) > 0.95
@@ -103,7 +104,7 @@ def test_true_poses_lay_views_onto_the_map(settings: SimulationSettings) -> None
 
 def test_masks_follow_the_pixel_centre_rule() -> None:
     course = fly(PATH, SHORT, 2)
-    simulator = Simulator(GROUND, SHORT.exact(), course, 2)
+    simulator = Simulator(GROUND, exact(SHORT), course, 2)
     mask = simulator.mask(3)
     row = course.frame_index[3]
     rotation = world_from_camera(Attitude(), *course.roll_pitch_yaw[row])
@@ -228,9 +229,9 @@ def test_roofs_lean_outwards_by_their_height() -> None:
     path = np.array(
         [[LEFT + 200, BOTTOM + 340], [LEFT + 600, BOTTOM + 340]]
     )  # eastwards, the tower to the right
-    settings = replace(
-        SimulationSettings(), wobble_deg=0.0, cruise_pitch_deg=0.0, crab_sigma_deg=0.0, agl_sigma_m=0.0
-    ).exact()
+    settings = exact(
+        SimulationSettings(wobble_deg=0.0, cruise_pitch_deg=0.0, crab_sigma_deg=0.0, agl_sigma_m=0.0)
+    )
     course = fly(path, settings, 1)
     simulator = Simulator(RaisedFootprints.from_polygons(tower, [30.0]), settings, course, 1)
     frame = 6  # 150 m on, beside the tower

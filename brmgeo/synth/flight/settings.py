@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from pydantic import Field
@@ -121,13 +121,3 @@ class SimulationSettings:
     vignette: Share = 0.15
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92
     sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 152.0
-
-    def exact(self) -> SimulationSettings:
-        """The same flight with perfect instruments and masks."""
-        return replace(
-            self,
-            attitude_error_deg=0.0,
-            agl_error_m=0.0,
-            masks=MaskErrors.none(),
-            odometry=None if self.odometry is None else OdometryErrors.none(),
-        )
