@@ -151,7 +151,7 @@ def _touching(keys: set[tuple[int, int]]) -> list[set[tuple[int, int]]]:
         if near in number
     ]
     a, b = np.array(beside, np.int64).reshape(-1, 2).T
-    pairs = coo_array((np.ones(len(a), np.bool_), (a, b)), shape=(len(places), len(places)))
+    pairs = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(len(places), len(places)))
     count, group = connected_components(pairs, directed=False)
     return [{places[i] for i in np.flatnonzero(group == k)} for k in range(count)]
 
