@@ -126,3 +126,19 @@ main()
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("demo True\n")
     assert "buildings" in done.stdout
+
+
+def test_the_installed_command_locates_as_the_checkout_does(
+    installed: Path, maps: Path, whole: Path, results: Path, tmp_path: Path
+) -> None:
+    words = ["localize", "--maps", str(maps), "--flight", str(whole), "--out", str(tmp_path / "out")]
+    code = f"""
+import sys
+sys.path = [p for p in sys.path if p != {str(ROOT)!r}]
+sys.argv = ["brmgeo", *{words!r}]
+from brmgeo.__main__ import main
+main()
+"""
+    done = _python(code, cwd=tmp_path, path=installed)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "fixes.csv").read_bytes() == (results / "mask" / "fixes.csv").read_bytes()
