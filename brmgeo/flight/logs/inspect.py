@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pyproj import Geod
 
 from brmgeo.errors import InputError, MissingExtraError
 from brmgeo.flight import checks, frames
@@ -136,20 +137,16 @@ def _axis(up: FloatArray) -> str:
 
 
 def gnss_track(log: Log) -> Odometry | None:
-    """The GNSS positions of a log as a track about their first: metres east, north, up (good to kilometres)."""
+    """The GNSS positions of a log as a track about their first: metres east and north by azimuth and distance, and up."""
     g = log.gnss
     if g is None or len(g.t_s) < 2:
         return None
-    east = np.radians(g.lon_deg - g.lon_deg[0]) * 6378137.0 * math.cos(math.radians(g.lat_deg[0]))
-    north = (
-        np.radians(g.lat_deg - g.lat_deg[0])
-        * 6356752.0
-        * (1.0 + 0.0101 * math.sin(math.radians(g.lat_deg[0])) ** 2)
-    )
+    n = len(g.t_s)
+    first = np.full(n, g.lon_deg[0]), np.full(n, g.lat_deg[0])
+    azimuth_deg, _, distance_m = Geod(ellps="WGS84").inv(*first, g.lon_deg, g.lat_deg)
+    east, north = distance_m * np.sin(np.radians(azimuth_deg)), distance_m * np.cos(np.radians(azimuth_deg))
     up = np.where(np.isfinite(g.alt_m), g.alt_m, 0.0)
-    return Odometry(
-        g.t_s, np.stack([east, north, up - up[0]], axis=-1), np.tile([1.0, 0, 0, 0], (len(east), 1)), "GNSS"
-    )
+    return Odometry(g.t_s, np.stack([east, north, up - up[0]], axis=-1), np.tile([1.0, 0, 0, 0], (n, 1)), "GNSS")
 
 
 def _against_gnss(log: Log, track: Odometry) -> float | None:
