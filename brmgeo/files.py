@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,24 @@ def read_json(path: Path) -> Any | None:
         return json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
+
+
+@contextlib.contextmanager
+def whole_files(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """An empty scratch folder in ``folder`` whose files of these names move there, in this order, when the block ends.
+
+    After an error ``folder`` stays as it was. What a killed process left of its scratch folder goes first, so one process
+    at a time may write there.
+    """
+    scratch = folder / f"{SCRATCH}files"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    try:
+        yield scratch
+        for name in names:
+            os.replace(scratch / name, folder / name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 @contextlib.contextmanager

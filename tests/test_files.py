@@ -173,6 +173,30 @@ def test_scratch_folders_of_killed_runs_are_cleared_after_an_hour(tmp_path: Path
     assert [p.name for p in out.iterdir()] == ["b"]
 
 
+def test_several_files_come_together_or_none_does(tmp_path: Path) -> None:
+    def write(text: str, *, fails: bool = False) -> None:
+        with files.whole_files(tmp_path, ("a", "b")) as scratch:
+            for name in ("b", "a", "of the work"):
+                (scratch / name).write_text(text)
+            if fails:
+                raise ValueError("on the way")
+
+    def there() -> dict[str, str]:
+        return {p.name: p.read_text() for p in tmp_path.iterdir()}
+
+    (tmp_path / "other").write_text("stays")
+    write("one")
+    assert there() == {"a": "one", "b": "one", "other": "stays"}
+    with pytest.raises(ValueError, match="on the way"):
+        write("two", fails=True)
+    assert there() == {"a": "one", "b": "one", "other": "stays"}
+    left = tmp_path / f"{files.SCRATCH}files"
+    left.mkdir()
+    (left / "a").write_text("of a killed run")
+    write("three")
+    assert there() == {"a": "three", "b": "three", "other": "stays"}
+
+
 @pytest.mark.skipif(os.name != "posix", reason="file modes are POSIX's")
 def test_folders_have_the_mode_that_the_umask_asks_for(tmp_path: Path) -> None:
     # In a process of its own: the umask belongs to the whole process.

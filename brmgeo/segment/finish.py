@@ -6,7 +6,6 @@ Scores are taken as prediction would answer: at the frames' own GSD, by the weig
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
-from brmgeo.files import write_bytes
+from brmgeo.files import whole_files, write_bytes
 from brmgeo.segment.augment import MEAN, STD
 from brmgeo.segment.ground import ScoredFrame, TrainingGround
 from brmgeo.segment.metrics import LogitHistogram, MaskScores, best_threshold, segmentation_scores
@@ -26,6 +25,9 @@ from brmgeo.segment.recipe import Recipe
 from brmgeo.segment.train import tensors_of
 from brmgeo.segment.unet import shifted
 from brmgeo.segment.weights import ModelCard, save_weights
+
+#: What a run writes: the weights first, for all else belongs to them.
+RESULTS = ("model.safetensors", "model.md", "model.onnx", "reliability.png")
 
 
 def finish(
@@ -58,55 +60,51 @@ def finish(
         data={"recipe": recipe.title, "steps": steps, "sources": ground.credits},
         licence=licence_of(ground.credits),
     )  # fmt: skip
-    made = out / ".finish"
-    shutil.rmtree(made, ignore_errors=True)
-    made.mkdir(parents=True)
-    weights = made / "model.safetensors"
-    save_weights(weights, tensors_of(state), card)
-    asked = {
-        looks: histograms(Segmenter.load(weights, "torch", looks=looks), ground.validation)
-        for looks in range(1, LOOKS + 1)
-    }
-    reached = {looks: best_threshold(grounds)[1] for looks, grounds in asked.items()}
-    looks = max(reached, key=lambda k: reached[k])
-    say(f"IoU on validation {reached[1]:.4f} by one look, {reached[2]:.4f} by two: weights for {looks}")
-    before = weighed(asked[looks])
-    temperature, shift = before.calibration()
-    card = replace(card, temperature=round(temperature, 4))
-    # The shift goes into the weights: whoever reads them, or the ONNX, has calibrated answers without knowing of it.
-    tensors = tensors_of(shifted(state, shift))
-    save_weights(weights, tensors, card)
-    # What fits the mean of two looks goes into each of them, which is nearly the same: so the threshold is chosen, and the
-    # calibration's error taken, on what comes out.
-    segmenter = Segmenter.load(weights, "torch", looks=looks)
-    grounds = histograms(segmenter, ground.validation)
-    after = weighed(grounds)
-    card = replace(card, threshold=round(best_threshold(grounds)[0], 3))
-    calibration = {
-        "looks": segmenter.looks,
-        "temperature": card.temperature,
-        "shift": round(shift, 4),
-        "threshold": card.threshold,
-        "calibration_error_before": round(before.calibration_error(), 4),
-        "calibration_error": round(after.calibration_error(), 4),
-    }
-    say(
-        f"calibrated on validation: temperature {card.temperature}, shift {calibration['shift']}, threshold {card.threshold}"
-    )
-    scores = _all_scores(replace(segmenter, card=card), ground)
-    for name, row in scores.items():
-        say(f"{name}: " + ", ".join(f"{k} {v:g}" for k, v in row.items()))
-    # The scores belong into the card; the tensors and with them the answers stay what they are.
-    card = replace(card, metrics={"calibration": calibration, **scores})
-    save_weights(weights, tensors, card)
-    export_onnx(weights, made / "model.onnx")
-    write_bytes(made / "reliability.png", reliability({"as trained": before, "calibrated": after}))
-    # What belongs to other weights goes before they do.
-    for name in ("model.onnx", "metrics.json"):
-        (out / name).unlink(missing_ok=True)
-    for name in ("model.safetensors", "model.md", "model.onnx", "reliability.png"):
-        (made / name).replace(out / name)
-    made.rmdir()
+    with whole_files(out, RESULTS) as made:
+        weights = made / "model.safetensors"
+        save_weights(weights, tensors_of(state), card)
+        asked = {
+            looks: histograms(Segmenter.load(weights, "torch", looks=looks), ground.validation)
+            for looks in range(1, LOOKS + 1)
+        }
+        reached = {looks: best_threshold(grounds)[1] for looks, grounds in asked.items()}
+        looks = max(reached, key=lambda k: reached[k])
+        say(f"IoU on validation {reached[1]:.4f} by one look, {reached[2]:.4f} by two: weights for {looks}")
+        before = weighed(asked[looks])
+        temperature, shift = before.calibration()
+        card = replace(card, temperature=round(temperature, 4))
+        # The shift goes into the weights: whoever reads them, or the ONNX, has calibrated answers without knowing of it.
+        tensors = tensors_of(shifted(state, shift))
+        save_weights(weights, tensors, card)
+        # What fits the mean of two looks goes into each of them, which is nearly the same: so the threshold is chosen,
+        # and the calibration's error taken, on what comes out.
+        segmenter = Segmenter.load(weights, "torch", looks=looks)
+        grounds = histograms(segmenter, ground.validation)
+        after = weighed(grounds)
+        card = replace(card, threshold=round(best_threshold(grounds)[0], 3))
+        calibration = {
+            "looks": segmenter.looks,
+            "temperature": card.temperature,
+            "shift": round(shift, 4),
+            "threshold": card.threshold,
+            "calibration_error_before": round(before.calibration_error(), 4),
+            "calibration_error": round(after.calibration_error(), 4),
+        }
+        say(
+            f"calibrated on validation: temperature {card.temperature}, shift {calibration['shift']}, "
+            f"threshold {card.threshold}"
+        )
+        scores = _all_scores(replace(segmenter, card=card), ground)
+        for name, row in scores.items():
+            say(f"{name}: " + ", ".join(f"{k} {v:g}" for k, v in row.items()))
+        # The scores belong into the card; the tensors and with them the answers stay what they are.
+        card = replace(card, metrics={"calibration": calibration, **scores})
+        save_weights(weights, tensors, card)
+        export_onnx(weights, made / "model.onnx")
+        write_bytes(made / "reliability.png", reliability({"as trained": before, "calibrated": after}))
+        # What belongs to other weights goes before they do.
+        for name in ("model.onnx", "metrics.json"):
+            (out / name).unlink(missing_ok=True)
     return {"calibration": calibration, "scores": scores}
 
 
