@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from brmgeo.errors import InputError, MissingInputError
+from brmgeo.files import told
 
 #: Endings of the picture files that are looked for in folders.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
@@ -48,7 +49,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: the picture cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: the picture cannot be read ({told(error)})") from None
 
 
 def decode(data: bytes, name: str, *, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
@@ -73,14 +74,22 @@ def decode(data: bytes, name: str, *, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
     return np.ascontiguousarray(image)
 
 
-def encode(image: NDArray[np.uint8], suffix: str = ".png", *, quality: int = 95) -> bytes:
-    """The bytes of a picture file: (h, w) grey or (h, w, 3) RGB; ``quality`` of a JPEG, 1 to 100."""
+def encode(
+    image: NDArray[np.uint8], suffix: str = ".png", *, quality: int = 95, options: Sequence[int] = ()
+) -> bytes:
+    """The bytes of a picture file: (h, w) grey or (h, w, 3) RGB; ``quality`` of a JPEG, 1 to 100; ``options``: OpenCV's."""
     bands = image[:, :, ::-1] if image.ndim == 3 else image
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(bands), options)
+    own = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(bands), [*own, *options])
     if not done:
         raise ValueError(f"a picture of {image.shape} {image.dtype} cannot be written as {suffix}")
     return data.tobytes()
+
+
+def photographed(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """A (h, w, 3) RGB picture after the JPEG, of a quality of 1 to 100, that a camera would store."""
+    data = np.frombuffer(encode(rgb, ".jpg", quality=quality), np.uint8)
+    return np.ascontiguousarray(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1])
 
 
 # --- as 8-bit RGB ------------------------------------------------------------------------------------------------

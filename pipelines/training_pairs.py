@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.pictures import SUFFIXES
 from brmgeo.region import TrainingSettings
 from brmgeo.segment import SPLITS
 from brmgeo.segment.pairs import read_pair
@@ -38,7 +39,7 @@ from .training_stages import (
 )
 
 PAIRS_A_SHARD = 512
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+PICTURES = (*SUFFIXES, ".webp")
 Pair = tuple[str, str, str]
 """Key, name of the image, name of the mask."""
 

@@ -44,6 +44,17 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
         pictures.read_bytes(tmp_path / "gone.png")
 
 
+def test_a_photograph_has_lost_a_little_and_keeps_its_colours() -> None:
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:, :32, 0], picture[:, 32:, 2] = 200, 150
+    seen = pictures.photographed(picture, 90)
+    assert seen.shape == picture.shape
+    assert seen.dtype == np.uint8
+    assert (seen != picture).any()
+    assert np.abs(seen[8:40, 4:28].astype(int) - (200, 0, 0)).max() < 6
+    assert np.abs(seen[8:40, 36:60].astype(int) - (0, 0, 150)).max() < 6
+
+
 def test_grey_and_transparent_pictures_as_rgb() -> None:
     grey = _picture()[:, :, 0]
     rgb, known = pictures.rgb_of(grey, "a")

@@ -25,6 +25,7 @@ from brmgeo.locate.flights import locate
 from brmgeo.locate.maps import Maps, match_settings, read_maps
 from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_mask
 from brmgeo.match import GroundMap
+from brmgeo.pictures import photographed
 from brmgeo.region import FlightSettings
 from brmgeo.synth.flight import (
     Course,
@@ -42,7 +43,6 @@ from brmgeo.synth.mission import (
     imagery_along,
     inset,
     path_name,
-    photographed,
     read_ground,
     simulator_settings,
 )

@@ -173,9 +173,8 @@ def write_picture(folder: Path, file: str, rgb: NDArray[np.uint8], *, quality: i
 
 def write_mask(folder: Path, file: str, mask: NDArray[np.uint8]) -> None:
     """Writes the mask of the frame ``file``, (h, w) uint8 of 0 and 255, into masks/ as a picture of one bit a pixel."""
-    ok, data = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_BILEVEL, 1])
-    assert ok
-    (folder / "masks" / PurePosixPath(file).with_suffix(".png")).write_bytes(data.tobytes())
+    data = encode(mask, options=(cv2.IMWRITE_PNG_BILEVEL, 1))
+    (folder / "masks" / PurePosixPath(file).with_suffix(".png")).write_bytes(data)
 
 
 def copy_thinned(flight: Flight, rows: Sequence[int], out: Path) -> None:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,7 @@ from brmgeo.errors import FlightError, InputError, MissingInputError
 from brmgeo.files import digest_of, write_bytes
 from brmgeo.flight.camera import slant_gsd_m
 from brmgeo.flight.folder import Flight
-from brmgeo.pictures import encode
+from brmgeo.pictures import decode, encode, read_bytes
 from brmgeo.segment.predict import Answer, Picture, Segmenter, mask_of, picture_of, read_image
 from brmgeo.segment.weights import ModelCard
 
@@ -290,9 +289,9 @@ def probability_of(stored: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _read_stored(path: Path) -> NDArray[np.uint8] | None:
-    if not path.is_file():
+    """(h, w) of an answer that was kept; None where it is not there, or damaged."""
+    try:
+        image = decode(read_bytes(path), str(path))
+    except InputError:
         return None
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    return (
-        None if image is None or image.ndim != 2 or image.dtype != np.uint8 else np.asarray(image, np.uint8)
-    )
+    return np.asarray(image, np.uint8) if image.ndim == 2 and image.dtype == np.uint8 else None

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from brmgeo.codes import LABEL_BUILDING as BUILDING
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import SettingsError
+from brmgeo.pictures import photographed
 from brmgeo.settings import require_within
 
 U8 = NDArray[np.uint8]
@@ -262,10 +263,7 @@ def recolour(image: U8, label: U8, gsd_m: float, rng: np.random.Generator, setti
         img = np.asarray(img + np.float32(sigma) * noise, np.float32)
     out = np.clip(img, 0, 255).astype(np.uint8)
     if rng.random() < settings.jpeg:
-        bgr = np.ascontiguousarray(out[..., ::-1])
-        ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
-        assert ok
-        out = np.ascontiguousarray(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
+        out = photographed(out, int(rng.integers(35, 96)))
     return out
 
 

@@ -34,12 +34,14 @@ from brmgeo.codes import LABEL_BUILDING as BUILDING
 from brmgeo.codes import LABEL_OTHER as OTHER
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import InputError, MissingInputError
-from brmgeo.pictures import decode
+from brmgeo.files import told
+from brmgeo.pictures import decode, encode
 from brmgeo.segment import SPLITS
 
 FORMAT, VERSION = "brmgeo-tiles", 1
 TILES_JSON, INDEX_CSV = "tiles.json", "index.csv"
 JPEG_QUALITY = 95
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
 ImageFormat = Literal["jpg", "png"]
 
 COLUMNS = (
@@ -142,23 +144,15 @@ def _rest(info: TileInfo) -> tuple[float, str, str, float, float, tuple[float, f
 
 def encode_image(image: NDArray[np.uint8], image_format: ImageFormat) -> bytes:
     """JPEG (quality 95, colour at full size) or PNG of (h, w, 3) uint8 RGB."""
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    options = (
-        [
-            cv2.IMWRITE_JPEG_QUALITY,
-            JPEG_QUALITY,
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-        ]
-        if image_format == "jpg"
-        else [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    )
-    return bytes(cv2.imencode(f".{image_format}", bgr, options)[1])
+    if image_format == "png":
+        return encode(image, options=_PNG)
+    full = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+    return encode(image, ".jpg", quality=JPEG_QUALITY, options=full)
 
 
 def encode_label(label: NDArray[np.uint8]) -> bytes:
     """PNG of (h, w) uint8."""
-    return bytes(cv2.imencode(".png", label, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1])
+    return encode(label, options=_PNG)
 
 
 def _or_none(value: float) -> float | None:
@@ -255,7 +249,7 @@ class TileSet:
         try:
             file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); cut the tiles again") from None
+            raise InputError(f"{path}: cannot be read ({told(error)}); cut the tiles again") from None
         try:
             picture = os.pread(file, place.image_size, place.image_offset)
             mask = os.pread(file, place.label_size, place.label_offset)

@@ -15,7 +15,6 @@ from brmgeo.errors import MissingInputError
 from brmgeo.flight.readings import Camera, FloatArray
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.raster import read_raster
-from brmgeo.pictures import decode, encode
 from brmgeo.region import FlightSettings
 from brmgeo.synth.flight import (
     Imagery,
@@ -115,8 +114,3 @@ def _seen_deg(settings: SimulationSettings) -> float:
     fov = 2 * math.degrees(math.atan(camera.half_fov_tan))
     tilt = math.degrees(math.hypot(mount.roll_rad, mount.pitch_rad))
     return float(max(fov, min(fov + 2 * tilt, 150.0)))
-
-
-def photographed(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    """A (h, w, 3) RGB picture after the JPEG, of a quality of 1 to 100, that a camera would store."""
-    return np.asarray(decode(encode(picture, ".jpg", quality=quality), "a simulated frame"), np.uint8)

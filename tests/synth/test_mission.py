@@ -18,7 +18,6 @@ from brmgeo.synth.mission import (
     imagery_along,
     inset,
     path_name,
-    photographed,
     read_ground,
     simulator_settings,
 )
@@ -95,14 +94,3 @@ def test_finer_imagery_is_cut_out_around_the_route(maps: Path) -> None:
     assert drawn.gsd_m == 0.1
     reach = own.agl_m * np.tan(np.radians(own.fov_deg) / 2) * 2.5 + 60.0
     assert asked == [pytest.approx((1000 - reach, 2000 - reach, 1100 + reach, 2050 + reach))]
-
-
-def test_a_photograph_has_lost_a_little_and_keeps_its_colours() -> None:
-    picture = np.zeros((48, 64, 3), np.uint8)
-    picture[:, :32, 0], picture[:, 32:, 2] = 200, 150
-    seen = photographed(picture, 90)
-    assert seen.shape == picture.shape
-    assert seen.dtype == np.uint8
-    assert (seen != picture).any()
-    assert np.abs(seen[8:40, 4:28].astype(int) - (200, 0, 0)).max() < 6
-    assert np.abs(seen[8:40, 36:60].astype(int) - (0, 0, 150)).max() < 6
