@@ -2,7 +2,8 @@
 
 Ours are ENU (x east, y north, z up) for the world and FLU (x nose, y left, z up) for the body, REP-103. PX4 and
 ArduPilot write NED and FRD. A quaternion is (w, x, y, z), unit length, and named destination_from_source; its sign
-is of no meaning. Quaternion algebra after Kuipers, "Quaternions and Rotation Sequences" (1999).
+is of no meaning. Quaternion algebra after Kuipers, "Quaternions and Rotation Sequences" (1999): written out, because
+scipy's Rotation brings what it is given to unit length and refuses zero, while a log's values keep their bits here.
 """
 
 from __future__ import annotations
@@ -58,23 +59,8 @@ def rotate(wxyz: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
-    """(n, 4) unit quaternions of (n, 3, 3) rotations, by the largest component (Shepperd, 1978)."""
-    m = np.asarray(rotation, dtype=np.float64)
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    squares = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=-1)
-    out = np.empty((len(m), 4))
-    for i, largest in enumerate(squares.argmax(axis=1)):
-        r = m[i]
-        if largest == 0:
-            q = [1 + trace[i], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-        elif largest == 1:
-            q = [r[2, 1] - r[1, 2], 1 + 2 * r[0, 0] - trace[i], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]
-        elif largest == 2:
-            q = [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 + 2 * r[1, 1] - trace[i], r[1, 2] + r[2, 1]]
-        else:
-            q = [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 + 2 * r[2, 2] - trace[i]]
-        out[i] = q
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+    """(..., 4) unit quaternions of (..., 3, 3) rotations; one that is rounded counts as the rotation nearest to it."""
+    return np.asarray(Rotation.from_matrix(rotation).as_quat()[..., [3, 0, 1, 2]])
 
 
 def quaternion_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:

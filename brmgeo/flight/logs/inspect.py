@@ -146,7 +146,9 @@ def gnss_track(log: Log) -> Odometry | None:
     azimuth_deg, _, distance_m = Geod(ellps="WGS84").inv(*first, g.lon_deg, g.lat_deg)
     east, north = distance_m * np.sin(np.radians(azimuth_deg)), distance_m * np.cos(np.radians(azimuth_deg))
     up = np.where(np.isfinite(g.alt_m), g.alt_m, 0.0)
-    return Odometry(g.t_s, np.stack([east, north, up - up[0]], axis=-1), np.tile([1.0, 0, 0, 0], (n, 1)), "GNSS")
+    return Odometry(
+        g.t_s, np.stack([east, north, up - up[0]], axis=-1), np.tile([1.0, 0, 0, 0], (n, 1)), "GNSS"
+    )
 
 
 def _against_gnss(log: Log, track: Odometry) -> float | None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
+from brmgeo.flight.frames import quaternion_from_matrix
 from brmgeo.flight.motion import Pose
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Imu
 from brmgeo.flight.vio.delay import MAX_DELAY_S
@@ -117,7 +117,7 @@ class Vio:
         vio = self._filter
         self._merge(vio)
         p, _, rot, *_ = vio.through_imu(vio.p, vio.v, vio.rot, vio.t, t_s + vio.delay)
-        return replace(pose, t_s=t_s, xyz_m=p, wxyz=_wxyz(rot))
+        return replace(pose, t_s=t_s, xyz_m=p, wxyz=quaternion_from_matrix(rot))
 
     @property
     def filter(self) -> VioFilter | None:
@@ -247,7 +247,7 @@ class Vio:
             pose=Pose(
                 t_s=frame.t_s,
                 xyz_m=vio.p.copy(),
-                wxyz=_wxyz(vio.rot),
+                wxyz=quaternion_from_matrix(vio.rot),
                 segment=self._segment + vio.segment,
                 walk_m2=self._walk_m2 + vio.relief_walk,
             ),
@@ -261,10 +261,6 @@ class Vio:
             relief_m2=vio.relief_walk,
         )
         return self._newest
-
-
-def _wxyz(rotation: FloatArray) -> FloatArray:
-    return np.asarray(Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]])
 
 
 def _joined(parts: list[tuple[FloatArray, FloatArray, FloatArray]]) -> Imu | None:

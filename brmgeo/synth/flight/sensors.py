@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from brmgeo.codes import GRAVITY_M_S2
+from brmgeo.flight.frames import quaternion_from_euler
 from brmgeo.flight.readings import Altimeter, Imu, Odometry
 from brmgeo.synth.flight.course import ODOMETRY, RATE_HZ, SENSORS, Course
 from brmgeo.synth.flight.settings import OdometryErrors, SimulationSettings
@@ -43,10 +44,7 @@ def odometry_of(course: Course, errors: OdometryErrors, seed: int) -> Odometry:
         if first < n:
             origin[first:] = track[first]
     track = track - origin
-    quaternion = Rotation.from_euler(
-        "ZYX", np.stack([rpy[:, 2] + turn, rpy[:, 1], rpy[:, 0]], axis=-1)
-    ).as_quat()
-    wxyz = np.round(quaternion[:, [3, 0, 1, 2]], 9)
+    wxyz = np.round(quaternion_from_euler(rpy[:, 0], rpy[:, 1], rpy[:, 2] + turn), 9)
     wxyz /= np.linalg.norm(wxyz, axis=1, keepdims=True)
     keep = ~silent
     return Odometry(np.round(t, 6)[keep], np.round(track, 4)[keep], wxyz[keep], "odometry.tum")
