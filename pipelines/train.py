@@ -5,7 +5,6 @@ Folders that are not part of the project are given with ``--source NAME=PATH``.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,6 +18,7 @@ from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.extras import extra
 from brmgeo.files import write_bytes, write_json, write_text
 from brmgeo.region import load_region
+from brmgeo.segment.predict import cores
 from brmgeo.segment.shards import TileSet, read_tiles
 from brmgeo.segment.weights import ModelCard, load_weights
 
@@ -201,7 +201,7 @@ def train(
     """
     started = time.monotonic()
     recipe = _of_steps(read_recipe(recipe_path), steps)
-    settings = replace(recipe.training, threads=threads or recipe.training.threads or _cores())
+    settings = replace(recipe.training, threads=threads or recipe.training.threads or cores())
     # What a first run lacks is said before any ground is painted.
     engine.require_fit(recipe.unet, settings)
     initial, before = load_weights(start) if start is not None else (None, None)
@@ -263,11 +263,6 @@ def _of_steps(recipe: Recipe, steps: int | None) -> Recipe:
     own = recipe.training
     warmup, mean_from = min(own.warmup_steps, steps // 4), min(own.mean_from, steps)
     return replace(recipe, training=replace(own, steps=steps, warmup_steps=warmup, mean_from=mean_from))
-
-
-def _cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _require_same_network(recipe: Recipe, before: ModelCard, start: Path | None) -> None:

@@ -199,7 +199,8 @@ def _load_onnx(path: Path, threads: int) -> tuple[_OnnxNetwork, ModelCard]:
     return _OnnxNetwork(session), card
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -258,7 +259,7 @@ class Segmenter:
                 f"{given}: there are no such weights; give a file that is there, or train some",
                 needs="weights",
             )
-        threads = threads or _cores()
+        threads = threads or cores()
         graph, tensors = given.with_suffix(".onnx"), given.with_suffix(".safetensors")
         if backend is None:
             backend = "onnx" if graph.is_file() else "torch"
