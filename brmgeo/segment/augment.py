@@ -97,7 +97,10 @@ class AugmentSettings:
     @staticmethod
     def none(gsd_m: float) -> AugmentSettings:
         """Crops at one GSD, north up, with nothing changed: for validation."""
-        return AugmentSettings((gsd_m, gsd_m), False, 0.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        return AugmentSettings(
+            gsd_m=(gsd_m, gsd_m), turn=False, tilt=0.0, near_buildings=0.5, enlarge=0, roofs=0, objects=0,
+            colour=0, grey=0, shadow=0, haze=0, blur=0, noise=0, jpeg=0,
+        )  # fmt: skip
 
     @property
     def finest_m(self) -> float:

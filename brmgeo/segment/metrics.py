@@ -50,7 +50,7 @@ class MaskScores:
     frames: int = 0
 
     def __add__(self, other: MaskScores) -> MaskScores:
-        return MaskScores(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+        return MaskScores(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
     @property
     def accuracy(self) -> float:
@@ -126,17 +126,17 @@ def segmentation_scores(
     f_estimate, f_truth = ring_features(estimate, known, n), ring_features(truth, known, n)
     measured = np.isfinite(f_truth)
     return MaskScores(
-        hit,
-        false,
-        missed,
-        int(np.count_nonzero(known)) - hit - false - missed,
-        int(np.count_nonzero(edges[0])),
-        int(np.count_nonzero(edges[0] & near[1])),
-        int(np.count_nonzero(edges[1])),
-        int(np.count_nonzero(edges[1] & near[0])),
-        int(np.count_nonzero(measured)),
-        float(np.abs(f_estimate - f_truth)[measured].sum()),
-        1,
+        hit=hit,
+        false=false,
+        missed=missed,
+        rest=int(np.count_nonzero(known)) - hit - false - missed,
+        edge_estimate=int(np.count_nonzero(edges[0])),
+        edge_estimate_hit=int(np.count_nonzero(edges[0] & near[1])),
+        edge_label=int(np.count_nonzero(edges[1])),
+        edge_label_hit=int(np.count_nonzero(edges[1] & near[0])),
+        features=int(np.count_nonzero(measured)),
+        feature_error=float(np.abs(f_estimate - f_truth)[measured].sum()),
+        frames=1,
     )
 
 

@@ -21,7 +21,7 @@ import os
 import tarfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -127,8 +127,7 @@ class ShardWriter:
         place = _Place(
             name, at_image, len(picture), zlib.crc32(picture), at_label, len(mask), zlib.crc32(mask)
         )
-        own = TileInfo(info.key, self._number, *_rest(info))
-        self.entries.append((own, place))
+        self.entries.append((replace(info, shard=self._number), place))
 
     def _append(self, name: str, data: bytes) -> int:
         member = tarfile.TarInfo(name)
@@ -136,10 +135,6 @@ class ShardWriter:
         self._tar.addfile(member, io.BytesIO(data))
         # A tar pads each file to 512 bytes; its data begins one header before the padded end.
         return self._tar.offset - -(-len(data) // 512) * 512
-
-
-def _rest(info: TileInfo) -> tuple[float, str, str, float, float, tuple[float, float, float, float], str]:
-    return (info.gsd_m, info.split, info.region, info.building_share, info.known_share, info.bounds, info.crs)
 
 
 def encode_image(image: NDArray[np.uint8], image_format: ImageFormat) -> bytes:
@@ -198,8 +193,9 @@ def _read_index(path: Path) -> Iterator[tuple[TileInfo, _Place]]:
                 place = [float(v) if v else math.nan for v in row[7:11]]
                 yield (
                     TileInfo(
-                        row[0], int(row[1]), float(row[4]), row[3], row[2], float(row[5]), float(row[6]),
-                        (place[0], place[1], place[2], place[3]), row[11],
+                        key=row[0], shard=int(row[1]), region=row[2], split=row[3], gsd_m=float(row[4]),
+                        building_share=float(row[5]), known_share=float(row[6]),
+                        bounds=(place[0], place[1], place[2], place[3]), crs=row[11],
                     ),
                     _Place(row[12], *(int(v) for v in row[13:19])),
                 )  # fmt: skip

@@ -169,7 +169,18 @@ def test_tiles_are_cut_for_what_they_are_wanted_for(monkeypatch: pytest.MonkeyPa
     class Cut:
         def __init__(self, splits: list[str]) -> None:
             self.infos = [
-                TileInfo(str(k), 0, 0.25, s, "a", 0.1, 1.0, (0, 0, 1, 1), "") for k, s in enumerate(splits)
+                TileInfo(
+                    key=str(k),
+                    shard=0,
+                    gsd_m=0.25,
+                    split=s,
+                    region="a",
+                    building_share=0.1,
+                    known_share=1.0,
+                    bounds=(0, 0, 1, 1),
+                    crs="",
+                )
+                for k, s in enumerate(splits)
             ]
 
         def __len__(self) -> int:

@@ -250,7 +250,17 @@ class Set:
 
     def __init__(self) -> None:
         self.infos = [
-            TileInfo(str(k), 0, 0.25, "train", "r", 0.1 * (k % 2), 1.0, (0, 0, 1, 1), "EPSG:5187")
+            TileInfo(
+                key=str(k),
+                shard=0,
+                gsd_m=0.25,
+                split="train",
+                region="r",
+                building_share=0.1 * (k % 2),
+                known_share=1.0,
+                bounds=(0, 0, 1, 1),
+                crs="EPSG:5187",
+            )
             for k in range(6)
         ]
 

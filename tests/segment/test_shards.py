@@ -35,15 +35,15 @@ def pairs(count: int = 7) -> list[tuple[TileInfo, U8, U8]]:
         size = (64, 96) if i % 2 else (64, 64)
         place = (500.25 + i, 100.0, 516.25 + i, 116.0) if i != 3 else (math.nan,) * 4
         info = TileInfo(
-            f"r-0250-{i:05d}",
-            0,
-            0.25,
-            ("train", "test")[i % 2],
-            "r",
-            0.1 * i,
-            1.0,
-            place,
-            "EPSG:5187" if i != 3 else "",
+            key=f"r-0250-{i:05d}",
+            shard=0,
+            gsd_m=0.25,
+            split=("train", "test")[i % 2],
+            region="r",
+            building_share=0.1 * i,
+            known_share=1.0,
+            bounds=place,
+            crs="EPSG:5187" if i != 3 else "",
         )
         smooth = cv2.resize(
             rng.integers(0, 255, (8, 8, 3), dtype=np.uint8), size[::-1], interpolation=cv2.INTER_CUBIC
