@@ -132,10 +132,6 @@ class UNet(nn.Module):
         out: Tensor = self.head(x)
         return out
 
-    def parameter_count(self) -> int:
-        """Number of trained numbers."""
-        return sum(p.numel() for p in self.parameters())
-
 
 def shifted(state: Mapping[str, Tensor], shift: float) -> dict[str, Tensor]:
     """Weights of a U-Net every logit of which is ``shift`` higher than with ``state``."""

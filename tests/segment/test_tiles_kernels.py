@@ -31,16 +31,14 @@ BOUNDS = (180_460.0, 456_580.0, 181_960.0, 457_680.0)
 @settings(deadline=None)
 @given(
     st.tuples(st.integers(1, 900), st.integers(1, 900)),
-    st.sampled_from([64, 128, 256]),
-    st.integers(0, 200),
+    st.sampled_from([64, 128, 256]).flatmap(
+        lambda tile: st.tuples(st.just(tile), st.integers(0, min(tile - 1, 200)))
+    ),
 )
 def test_tiles_cover_everything_and_overlap_at_least_as_set(
-    shape: tuple[int, int], tile: int, overlap: int
+    shape: tuple[int, int], sizes: tuple[int, int]
 ) -> None:
-    if overlap >= tile:
-        with pytest.raises(ValueError):
-            tile_windows(shape, tile, overlap)
-        return
+    tile, overlap = sizes
     windows = tile_windows(shape, tile, overlap)
     covered = np.zeros(shape, bool)
     for w in windows:
@@ -56,6 +54,12 @@ def test_tiles_cover_everything_and_overlap_at_least_as_set(
         steps = np.diff(sorted(starts))
         assert (steps <= tile - overlap).all()
         assert (steps[:-1] == tile - overlap).all()  # only the last one is moved inwards
+
+
+@pytest.mark.parametrize("overlap", [-1, 64, 65, 200])
+def test_tiles_that_would_overlap_by_all_of_themselves_are_refused(overlap: int) -> None:
+    with pytest.raises(ValueError, match="cannot overlap"):
+        tile_windows((300, 200), 64, overlap)
 
 
 @pytest.mark.parametrize("guard", [0.0, 20.0, 75.0])
