@@ -40,6 +40,8 @@ KOREAN_KINDS = {
     "greenhouse": ("온실",),
     "temporary": ("가건물",),
 }
+#: The kind of each of those words.
+KIND_OF_NAME = {name: kind for kind, names in KOREAN_KINDS.items() for name in names}
 #: Layers that are buildings without being asked for: all but "unclassified".
 BUILDING_LAYERS = tuple(code for code in BUILDING_KINDS if code != "B0014110")
 #: Bounds a group of houses, and is no building.

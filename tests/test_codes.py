@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KOREAN_KINDS, disc_radii, layer_code
+from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KIND_OF_NAME, KOREAN_KINDS, disc_radii, layer_code
 
 
 def test_disc_radii_follow_equation_3() -> None:
@@ -20,3 +20,4 @@ def test_kinds_have_names_and_layers_codes() -> None:
     assert set(KOREAN_KINDS) == set(BUILDING_KINDS.values())
     assert all(layer_code(code.removeprefix("B001").lower()) == code for code in BUILDING_LAYERS)
     assert layer_code(" walls ") == "WALLS"
+    assert (KIND_OF_NAME["단독주택"], KIND_OF_NAME["무벽건물"]) == ("house", "wall-less")

@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from brmgeo.codes import BUILDING, BUILDING_KINDS, KOREAN_KINDS, OTHER, UNKNOWN, layer_code
+from brmgeo.codes import BUILDING, BUILDING_KINDS, KIND_OF_NAME, OTHER, UNKNOWN, layer_code
 
 QGIS_VERSION = "3.22.0"
 Style = list[ET.Element]
@@ -33,8 +33,7 @@ KINDS = {
     "under-construction": ("Under construction (공사중건물)", "#a9714b"),
     "unclassified": ("Unclassified building", "#9a86d6"),
 }
-_KIND_OF_NAME = {name: kind for kind, names in KOREAN_KINDS.items() for name in (kind, *names)}
-_KIND_OF_NAME["건물"] = "unclassified"
+_KIND_OF_WORD = {kind: kind for kind in KINDS} | KIND_OF_NAME | {"건물": "unclassified"}
 OTHER_COLOUR = "#9a86d6"
 STATUS_COLOURS = {"converged": "#35e0c8", "ambiguous": "#ffb02e", "lost": "#ff5d5d"}
 # Share of building: fine steps where countryside and villages differ, the whole of 0..1 so that maps compare.
@@ -53,7 +52,7 @@ RATIO_STOPS: tuple[tuple[float, str, int], ...] = (
 
 def kind_of(value: str) -> tuple[str, str] | None:
     """(label, colour) of an NGII layer code (``B0014112``, ``4112``) or of a kind (``house``), None for anything else."""
-    kind = BUILDING_KINDS.get(layer_code(value)) or _KIND_OF_NAME.get(value.strip())
+    kind = BUILDING_KINDS.get(layer_code(value)) or _KIND_OF_WORD.get(value.strip())
     return None if kind is None else KINDS[kind]
 
 

@@ -24,7 +24,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KOREAN_KINDS
+from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KIND_OF_NAME
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.extras import extra
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
@@ -53,7 +53,6 @@ EDGE_TOLERANCE_M = 0.05
 # Neatlines agree with the sheet number to less than a millimetre; a wrong datum moves them by some 300 m.
 NEATLINE_TOLERANCE_M = 5.0
 
-_KIND_OF_NAME = {name: kind for kind, names in KOREAN_KINDS.items() for name in names}
 _KIND_COLUMNS = ("kind", "종류")
 _FLOOR_COLUMNS = ("floors", "층수", "building:levels")
 
@@ -576,7 +575,7 @@ def _kinds(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> NDArray[np
     if column is not None:
         for i, value in enumerate(frame[column].tolist()):
             text = "" if value is None or value != value else str(value).strip()
-            out[i] = _KIND_OF_NAME.get(text) or BUILDING_KINDS.get(text.upper()) or text
+            out[i] = KIND_OF_NAME.get(text) or BUILDING_KINDS.get(text.upper()) or text
     return out
 
 

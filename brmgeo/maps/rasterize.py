@@ -14,10 +14,9 @@ overlap never cancel each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast
+from collections.abc import Sequence
+from typing import Any, cast
 
-import numba
 import numpy as np
 import shapely
 from affine import Affine
@@ -26,6 +25,7 @@ from odc.geo.geobox import GeoBox
 from shapely import STRtree
 
 from brmgeo.codes import UNKNOWN
+from brmgeo.maps.ratio import jit
 
 _STEPS = 1024  # positions per pixel, even: a pixel's centre is one of them
 _REACH_PX = 1_000_000  # products of two such distances in steps still fit 64 bits
@@ -33,14 +33,8 @@ _REACH_PX = 1_000_000  # products of two such distances in steps still fit 64 bi
 Polygons = Sequence[Any] | NDArray[Any]
 """Shapely Polygons and MultiPolygons in the lattice's CRS; empty ones and None are passed over."""
 
-_F = TypeVar("_F", bound=Callable[..., Any])
 
-
-def _jit(function: _F) -> _F:
-    return cast(_F, numba.njit(cache=True, nogil=True)(function))
-
-
-@_jit
+@jit
 def _fill(xy: Any, ring_ends: Any, part_ends: Any, mask: Any) -> None:
     """Sets the pixels of mask whose centres lie in a part.
 

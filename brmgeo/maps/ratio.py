@@ -72,13 +72,13 @@ class Disjoint(Compiler):
         super().__init__(typingctx, targetctx, library, args, ret, flags, locals_)  # type: ignore[no-untyped-call]
 
 
-def _jit(function: _F) -> _F:
+def jit(function: _F) -> _F:
     """numba.njit that compiles at the first call, keeps the result on disk and lets go of the GIL."""
     return cast(_F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def _jit_disjoint(function: _F) -> _F:
-    """_jit for a function that reads nothing through one array that it writes through another."""
+    """jit for a function that reads nothing through one array that it writes through another."""
     return cast(
         _F, numba.njit(cache=True, nogil=True, error_model="numpy", pipeline_class=Disjoint)(function)
     )
@@ -87,12 +87,12 @@ def _jit_disjoint(function: _F) -> _F:
 # --- adders on words; the casts keep numba from widening 16-bit words to 64 bits -------------------------------
 
 
-@_jit
+@jit
 def _sum(a: Any, b: Any, c: Any) -> Any:
     return np.uint16(np.uint16(a ^ b) ^ c)
 
 
-@_jit
+@jit
 def _carry(a: Any, b: Any, c: Any) -> Any:
     return np.uint16(np.uint16(a & b) | np.uint16(c & np.uint16(a | b)))
 
@@ -142,7 +142,7 @@ def _add_16(words: Any, at: Any, planes: Any, lowest: Any, carry: Any) -> None:
         p8[i] = _sum(s, e0, e1)
 
 
-@_jit
+@jit
 def _half_add(plane: Any, carry: Any) -> None:
     for i in range(carry.size):
         x, c = plane[i], carry[i]
@@ -150,7 +150,7 @@ def _half_add(plane: Any, carry: Any) -> None:
         carry[i] = np.uint16(x & c)
 
 
-@_jit
+@jit
 def _add(words: Any, base: int, offsets: Any, planes: Any, carries: Any, at: Any) -> None:
     """Adds the rows of words at base + offsets (a multiple of 16 of them) to the planes, modulo their number.
 
@@ -176,7 +176,7 @@ def _add(words: Any, base: int, offsets: Any, planes: Any, carries: Any, at: Any
 # --- words to numbers ------------------------------------------------------------------------------------------
 
 
-@_jit
+@jit
 def _swap(low: Any, high: Any, shift: Any, mask: Any) -> None:
     """Exchanges the bits of low under mask << shift with the bits of high under mask."""
     for i in range(low.size):
@@ -186,7 +186,7 @@ def _swap(low: Any, high: Any, shift: Any, mask: Any) -> None:
         low[i] = np.uint16(a ^ np.uint16(t << shift))
 
 
-@_jit
+@jit
 def _transposed(planes: Any, first: Any, square: Any) -> None:
     """Bit p of word k of square becomes bit k of plane first + p, or 0 where there is no such plane; square: (16, S)."""
     for p in range(16):
@@ -206,7 +206,7 @@ def _transposed(planes: Any, first: Any, square: Any) -> None:
                 _swap(square[p], square[p + distance], shift, mask)
 
 
-@_jit
+@jit
 def _emit(planes: Any, bias: int, square: Any, row: Any) -> None:
     """Writes the counts held in planes, less bias, to row (uint16, or uint32 where more than 16 planes are used)."""
     used, width = planes.shape[0], square.shape[1]
@@ -234,7 +234,7 @@ def _emit(planes: Any, bias: int, square: Any, row: Any) -> None:
 # --- packing and sliding ---------------------------------------------------------------------------------------
 
 
-@_jit
+@jit
 def _pack(mask: Any, value: int, row0: int, col0: int, border: Any, words: Any) -> None:
     """Packs ``mask == value`` around a tile into words[0] and its complement into words[1].
 
@@ -293,7 +293,7 @@ def _slider(
     return words, border, disc, arcs.ravel(), planes, square, carries, np.empty(16, np.uint64)
 
 
-@_jit
+@jit
 def _slide(slider: Any, y: int, row: Any) -> None:
     """Counts of the tile's row y into row: from nothing for row 0, for each other row from the one before it."""
     words, border, disc, arcs, planes, square, carries, at = slider
@@ -309,7 +309,7 @@ def _slide(slider: Any, y: int, row: Any) -> None:
     _emit(planes, y * (arcs.size // 2), square, row)
 
 
-@_jit
+@jit
 def _count_tile(slider: Any, tile: Any, out: Any) -> None:
     """Counts of a tile (row0, row1, col0, col1) into the whole out (H, W)."""
     row0, row1, col0, col1 = tile
@@ -317,7 +317,7 @@ def _count_tile(slider: Any, tile: Any, out: Any) -> None:
         _slide(slider, y, out[row0 + y, col0:col1])
 
 
-@_jit
+@jit
 def _extent(mask: Any, value: int, row0: int, row1: int, col0: int, col1: int) -> Any:
     """(row0, row1, col0, col1) of the pixels equal to value in a window of the mask; all 0 where there is none."""
     v = np.uint8(value)
@@ -338,7 +338,7 @@ def _extent(mask: Any, value: int, row0: int, row1: int, col0: int, col1: int) -
     return (top, bottom, left, right) if bottom else (0, 0, 0, 0)
 
 
-@_jit
+@jit
 def _census(mask: Any) -> Any:
     """Whether any pixel is UNKNOWN, and whether any is neither that nor 0 nor 1."""
     unknown, other = np.uint8(0), np.uint8(0)
@@ -354,7 +354,7 @@ def _census(mask: Any) -> Any:
 # --- ratios ----------------------------------------------------------------------------------------------------
 
 
-@_jit
+@jit
 def _clip(chord: Any, y: int, height: int, reach: Any) -> Any:
     """Chords of the disc about a pixel of row y that lie in the array: their number, and reach[x] summed over them.
 
@@ -370,7 +370,7 @@ def _clip(chord: Any, y: int, height: int, reach: Any) -> Any:
     return top + bottom + 1
 
 
-@_jit
+@jit
 def _divide(count: Any, known: Any, out: Any) -> None:
     """Count over known in units of 1e-4, rounded half up.
 
@@ -383,7 +383,7 @@ def _divide(count: Any, known: Any, out: Any) -> None:
         out[i] = np.uint16(np.int32(ratio)) if k > 0.0 else np.uint16(RATIO_UNKNOWN)
 
 
-@_jit
+@jit
 def _divide_by(count: Any, known: int, out: Any) -> None:
     """_divide where the whole row has one known count: a product, exact for the same reason."""
     scale, half = UNIT / np.float64(known), 0.5 + 0.25 / np.float64(known)
@@ -391,7 +391,7 @@ def _divide_by(count: Any, known: int, out: Any) -> None:
         out[i] = np.uint16(np.int32(np.float64(count[i]) * scale + half))
 
 
-@_jit
+@jit
 def _ratio_tile(
     slider: Any, shadow: Any, dark_window: Any, chord: Any, tile: Any, out: Any, scratch: Any
 ) -> None:

@@ -12,6 +12,8 @@ import click
 import pytest
 
 from brmgeo.errors import InputError
+from brmgeo.match import METHODS
+from pipelines.cli import METHODS as OFFERED
 from pipelines.cli import _Command, cli, run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,6 +48,11 @@ def test_a_need_that_this_command_has_no_option_for_is_left_out(capsys: pytest.C
 def test_a_full_disk_is_a_line_with_the_place(capsys: pytest.CaptureFixture[str]) -> None:
     told = _told(capsys, _fail(OSError(errno.ENOSPC, "No space left on device", "/mnt/a.tif")))
     assert told.startswith("brmgeo: /mnt/a.tif cannot be read or written: the disk is full")
+
+
+def test_the_methods_offered_are_those_that_there_are() -> None:
+    # The command line starts without the kernels, so it has a list of its own.
+    assert sorted(OFFERED) == sorted(METHODS)
 
 
 def test_every_need_of_the_library_is_a_parameter_of_some_command() -> None:

@@ -8,10 +8,10 @@ from typing import Annotated
 from pydantic import Field
 
 from brmgeo.flight.readings import Attitude, Camera
+from brmgeo.region import Share
 
 # Least and most of the numbers, held where a file of settings is read.
 NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(ge=0.1, le=1000.0)]
 
 
