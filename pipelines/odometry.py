@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from brmgeo.errors import InputError
 from brmgeo.files import whole_folder, write_text
 from brmgeo.flight.folder import MADE_BY, is_own_odometry, read_flight
-from brmgeo.flight.own import Method, estimate, thinned_rows
+from brmgeo.flight.own import OdometryMethod, estimate, thinned_rows
 from brmgeo.flight.write import copy_thinned, name_track, rounded_track, write_track
 
 
-def method_named(name: str) -> Method:
+def method_named(name: str) -> OdometryMethod:
     """The method of a name; InputError for another one."""
     if name not in ("auto", "vio", "planar"):
         raise InputError(f"method {name!r} is not known: choose auto, vio or planar")
     return name  # type: ignore[return-value]
 
 
-def make_odometry(flight_dir: Path, method: Method = "auto") -> dict[str, Any]:
+def make_odometry(flight_dir: Path, method: OdometryMethod = "auto") -> dict[str, Any]:
     """Makes a flight's odometry and writes it into its folder; returns the facts.
 
     ``odometry.tum`` (poses), ``odometry.covariance.csv`` (what they are worth), ``odometry.json`` (facts); flight.toml gets

@@ -134,7 +134,7 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
     relief = trial.masks is not None
     flown = simulate_views(ground, route, settings, trial.seed, maps.ground.gsd_m, relief=relief)
     truth = flown.reference.at(np.array([v.t_s for v in flown.views]))
-    scene = _Scene(trial, maps, ground, route, settings)
+    scene = _TrialFlight(trial, maps, ground, route, settings)
     seen = {"": flown.views}
     if trial.masks is not None:
         seen = {kind: scene.views(kind, trial.masks, flown.views) for kind in trial.masks.kinds}
@@ -162,7 +162,7 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
 
 
 @dataclass(frozen=True)
-class _Scene:
+class _TrialFlight:
     """One flight of a trial: what it flies over, along and with."""
 
     trial: Trial

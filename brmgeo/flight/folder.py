@@ -228,7 +228,7 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
     Raises FlightError, with file, line and column, at the first thing that is not as it should be.
     """
     folder = Path(folder)
-    toml = _Toml(folder / "flight.toml")
+    toml = _FlightToml(folder / "flight.toml")
     camera = _camera(toml)
     mount = Attitude(*(math.radians(toml.number("mount", k, 0.0, -360, 360)) for k in _KEYS["mount"]))
 
@@ -290,7 +290,7 @@ def may_be_remade(folder: Path) -> bool:
 # ---------------------------------------------------------------- flight.toml
 
 
-class _Toml:
+class _FlightToml:
     """flight.toml with typed, located access to its keys."""
 
     def __init__(self, path: Path) -> None:
@@ -369,7 +369,7 @@ class _Toml:
         return value
 
 
-def _camera(toml: _Toml) -> Camera:
+def _camera(toml: _FlightToml) -> Camera:
     width = int(toml.number("camera", "width", None, 8, 30000))
     height = int(toml.number("camera", "height", None, 8, 30000))
     intrinsics = [key for key in ("fx", "fy", "cx", "cy", "distortion") if toml.has("camera", key)]
@@ -420,7 +420,7 @@ def _camera(toml: _Toml) -> Camera:
     return camera
 
 
-def _frames(toml: _Toml, folder: Path, table: Table) -> tuple[Frame, ...]:
+def _frames(toml: _FlightToml, folder: Path, table: Table) -> tuple[Frame, ...]:
     path = table.path
     table.check_times()
     seen: dict[str, int] = {}
@@ -457,7 +457,7 @@ def _frames(toml: _Toml, folder: Path, table: Table) -> tuple[Frame, ...]:
     )
 
 
-def _heights(toml: _Toml, folder: Path, table: Table) -> FloatArray:
+def _heights(toml: _FlightToml, folder: Path, table: Table) -> FloatArray:
     times = table.numbers["t_s"]
     sources = ("frames", "altimeter", "fixed")
     source = toml.text("height", "source") if toml.has("height", "source") else None
@@ -568,7 +568,7 @@ def _check_files(folder: Path, names: Sequence[str], table: Table, camera: Camer
 
 
 def _odometry(
-    toml: _Toml, folder: Path, mount: Attitude, frames: tuple[Frame, ...], times: FloatArray
+    toml: _FlightToml, folder: Path, mount: Attitude, frames: tuple[Frame, ...], times: FloatArray
 ) -> Odometry | None:
     if "odometry" not in toml.data:
         stray = sorted(folder.glob("odometry.*"))
@@ -654,7 +654,7 @@ def _check_overlap(path: Path, what: str, t: FloatArray, times: FloatArray) -> N
         )
 
 
-def _reference(toml: _Toml, folder: Path) -> tuple[Path, str | None] | None:
+def _reference(toml: _FlightToml, folder: Path) -> tuple[Path, str | None] | None:
     name = toml.text("reference", "file") if toml.has("reference", "file") else "reference.csv"
     path = folder / name
     crs = toml.text("reference", "crs") if toml.has("reference", "crs") else None

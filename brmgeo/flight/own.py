@@ -24,7 +24,7 @@ from brmgeo.flight.planar import run_planar
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 from brmgeo.flight.vio import GyroInDegreesError, VioSettings, run_vio
 
-Method = Literal["auto", "vio", "planar"]
+OdometryMethod = Literal["auto", "vio", "planar"]
 MADE_FROM_FRAMES = "made from the frames"
 #: Slower than this, frames do not overlap enough in time for points to be followed between them.
 VIDEO_INTERVAL_S = 0.6
@@ -94,7 +94,7 @@ class _Pictures:
             self.spent_s += time.process_time() - begin
 
 
-def estimate(flight: Flight, method: Method = "auto") -> Embedded:
+def estimate(flight: Flight, method: OdometryMethod = "auto") -> Embedded:
     """The flight's odometry from its own frames.
 
     ``auto`` takes the visual-inertial filter where there is an imu.csv and video-rate frames, else the planar odometry.

@@ -75,16 +75,16 @@ def estimate(
     cells = np.column_stack([x + 2.0 * np.arange(n), np.full(n, y)])
     mass = np.arange(1, n + 1) / max(n * (n + 1) / 2, 1)
     return Estimate(
-        t_s,
-        status,
-        np.array([x, y]),
-        np.eye(2) * sigma**2,
-        yaw,
-        0.1,
-        0.9,
-        cells,
-        mass,
-        n,  # type: ignore[arg-type]
+        t_s=t_s,
+        status=status,  # type: ignore[arg-type]
+        mean=np.array([x, y]),
+        covariance=np.eye(2) * sigma**2,
+        yaw_rad=yaw,
+        yaw_sigma_rad=0.1,
+        mass=0.9,
+        candidates=cells,
+        candidate_mass=mass,
+        candidate_count=n,
     )
 
 

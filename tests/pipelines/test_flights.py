@@ -471,7 +471,16 @@ def test_the_caption_of_the_candidates_counts_what_is_drawn() -> None:
         places = np.zeros((shown, 2))
         return flight_results.how_many(
             Estimate(
-                0.0, "ambiguous", places[0], np.eye(2), math.nan, math.nan, 0.1, places, np.ones(shown), count
+                t_s=0.0,
+                status="ambiguous",
+                mean=places[0],
+                covariance=np.eye(2),
+                yaw_rad=math.nan,
+                yaw_sigma_rad=math.nan,
+                mass=0.1,
+                candidates=places,
+                candidate_mass=np.ones(shown),
+                candidate_count=count,
             )
         )
 

@@ -29,9 +29,20 @@ def results(tmp_path: Path) -> Path:
     out = tmp_path / "results"
     out.mkdir()
     estimates = [
-        Estimate(5.0 * i, "converged" if i > 1 else "ambiguous", xy, np.eye(2), 0.5, 0.1, 1.0, xy[None], np.ones(1), 1)
+        Estimate(
+            t_s=5.0 * i,
+            status="converged" if i > 1 else "ambiguous",
+            mean=xy,
+            covariance=np.eye(2),
+            yaw_rad=0.5,
+            yaw_sigma_rad=0.1,
+            mass=1.0,
+            candidates=xy[None],
+            candidate_mass=np.ones(1),
+            candidate_count=1,
+        )
         for i, xy in enumerate(XY)
-    ]  # fmt: skip
+    ]
     smoothed = TimedPath(np.arange(6) * 5.0, XY + 0.5, np.full(6, np.nan), np.full(6, 1.5))
     write_trajectory(out, estimates, [f"{i}.jpg" for i in range(6)], CRS, smoothed=smoothed)
     write_candidates(out, [(e.t_s, e.candidates, e.candidate_mass, e.status) for e in estimates], CRS)

@@ -126,7 +126,7 @@ def _paint(  # type: ignore[no-untyped-def]
 _NO_FIELD = np.zeros((2, 1, 1))
 
 
-class _Pose(NamedTuple):
+class _Sight(NamedTuple):
     rotation: FloatArray
     position: FloatArray
     box: tuple[float, float, float, float]  # bounds of the ground in sight
@@ -141,7 +141,7 @@ class Simulator:
     course: Course
     seed: int
 
-    def pose(self, frame: int, reach: float = 6.0) -> _Pose:
+    def pose(self, frame: int, reach: float = 6.0) -> _Sight:
         """The camera's true pose at a frame, and the box of ground it may see (``reach`` heights at most)."""
         row = self.course.frame_index[frame]
         roll, pitch, yaw = self.course.roll_pitch_yaw[row]
@@ -156,12 +156,12 @@ class Simulator:
         # The border alone bounds the ground in sight only when the nadir is added: near the horizon it opens.
         points = np.concatenate([points, position[None, :2]])
         low, high = points.min(axis=0) - 5.0, points.max(axis=0) + 5.0
-        return _Pose(rotation, position, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+        return _Sight(rotation, position, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
 
     def paint(
         self,
         image: NDArray[Any],
-        pose: _Pose,
+        pose: _Sight,
         ground: RaisedFootprints,
         chosen: NDArray[np.int64],
         values: NDArray[Any],
@@ -191,7 +191,7 @@ class Simulator:
         )
 
     def _pile(
-        self, pose: _Pose, chosen: NDArray[np.int64]
+        self, pose: _Sight, chosen: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.bool_]]:
         # Buildings as piles of outlines, far ones first and roofs last, close enough for every pixel of their walls to
         # be met: (k,) polygons, (k,) heights, (k,) whether it is the roof.

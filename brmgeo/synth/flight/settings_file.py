@@ -34,21 +34,21 @@ def read_simulation_settings(path: Path, base: SimulationSettings) -> Simulation
         made = replace(made, camera=_camera(toml, base.camera))
     if "mount" in toml.data:
         own = (math.degrees(v) for v in (base.mount.roll_rad, base.mount.pitch_rad, base.mount.yaw_rad))
-        turns = build(toml, _Mount, _Mount(*own), at=("mount",))
+        turns = build(toml, _MountKeys, _MountKeys(*own), at=("mount",))
         angles = (turns.roll_deg, turns.pitch_deg, turns.yaw_deg)
         made = replace(made, mount=Attitude(*(math.radians(v) for v in angles)))
     return made
 
 
 @dataclass(frozen=True, slots=True)
-class _Mount:
+class _MountKeys:
     roll_deg: float
     pitch_deg: float
     yaw_deg: float
 
 
 @dataclass(frozen=True, slots=True)
-class _Camera:
+class _CameraKeys:
     width: _Pixels
     height: _Pixels
     fov_deg: Annotated[float, Field(ge=0.1, le=179.0)] | None = None
@@ -67,7 +67,7 @@ class _Camera:
 
 
 def _camera(toml: Toml, base: Camera) -> Camera:
-    keys = build(toml, _Camera, _Camera(base.width, base.height), at=("camera",))
+    keys = build(toml, _CameraKeys, _CameraKeys(base.width, base.height), at=("camera",))
     size = keys.width, keys.height
     if keys.fx is not None and keys.fy is not None and keys.cx is not None and keys.cy is not None:
         camera = Camera(*size, keys.fx, keys.fy, keys.cx, keys.cy)
