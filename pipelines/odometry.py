@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError
-from brmgeo.files import whole_folder, write_text
+from brmgeo.files import whole_folder
 from brmgeo.flight.folder import MADE_BY, is_own_odometry, read_flight
 from brmgeo.flight.own import OdometryMethod, estimate, thinned_rows
-from brmgeo.flight.write import copy_thinned, name_track, rounded_track, write_track
+from brmgeo.flight.write import copy_thinned, name_track, rounded_track, write_facts, write_track
 
 
 def method_named(name: str) -> OdometryMethod:
@@ -37,7 +36,7 @@ def make_odometry(flight_dir: Path, method: OdometryMethod = "auto") -> dict[str
     stem = "odometry" if flight.odometry is None else "embedded"
     made = estimate(flight, method)
     facts = made.facts | {"track": f"{stem}.tum", "covariance": f"{stem}.covariance.csv"}
-    write_text(flight_dir / f"{stem}.json", json.dumps(facts, indent=1) + "\n")
+    write_facts(flight_dir, stem, facts)
     columns: dict[str, NDArray[Any]] = {
         "yaw_sigma_deg": np.round(np.degrees(made.yaw_sigma_rad), 4),
         "tracks": made.tracks,

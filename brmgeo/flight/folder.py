@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
@@ -116,13 +117,8 @@ class Flight:
                 raise FlightError(f"{path}: the mask is in colour: 0 is other, 255 is building, nothing else")
             image = image[:, :, 0]
         _check_size(path, (image.shape[1], image.shape[0]), self.camera)
-        other = (image != 0) & (image != 255)
-        if other.any():
-            row, column = np.argwhere(other)[0]
-            raise FlightError(
-                f"{path}: pixel (row {row}, column {column}) is {image[row, column]}: 0 is other, 255 is building, "
-                "nothing else"
-            )
+        if fault := mask_fault(image):
+            raise FlightError(f"{path}: {fault}")
         return np.asarray(image, dtype=np.uint8)
 
     def compass_yaw_rad(self, crs: str, x: float, y: float) -> list[float | None]:
@@ -216,6 +212,18 @@ class Flight:
             )
         _check_size(video.path, (image.shape[1], image.shape[0]), self.camera)
         return image
+
+
+def mask_fault(mask: NDArray[Any]) -> str:
+    """What is wrong with the values of a (height, width) mask of whole numbers; empty where nothing is."""
+    other = (mask != LABEL_OTHER) & (mask != LABEL_BUILDING)
+    if not other.any():
+        return ""
+    row, column = np.argwhere(other)[0]
+    return (
+        f"pixel (row {row}, column {column}) is {mask[row, column]}: {LABEL_OTHER} is other, {LABEL_BUILDING} is building, "
+        "nothing else"
+    )
 
 
 def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
@@ -614,11 +622,18 @@ def _odometry(
 
 def is_own_odometry(folder: Path) -> bool:
     """True where odometry.json says that ``brmgeo odometry`` makes, or made, the flight's odometry from its frames."""
+    return own_method(folder) is not None
+
+
+def own_method(folder: Path) -> str | None:
+    """How odometry.json says that the flight's odometry was made from its frames; None where it was not."""
     try:
         facts = json.loads((folder / "odometry.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(facts, dict) and facts.get("made_by") == MADE_BY
+        return None
+    if not isinstance(facts, dict) or facts.get("made_by") != MADE_BY:
+        return None
+    return str(facts.get("method", "unknown"))
 
 
 def _covariance(path: Path, odometry: Odometry) -> Odometry:

@@ -5,7 +5,6 @@ Video with an IMU goes through the visual-inertial filter, frames farther apart 
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.errors import FlightError
-from brmgeo.flight.folder import MADE_BY, Flight, is_own_odometry
+from brmgeo.flight.folder import MADE_BY, Flight, own_method
 from brmgeo.flight.planar import run_planar
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 from brmgeo.flight.vio import GyroInDegreesError, VioSettings, run_vio
@@ -248,8 +247,7 @@ def odometry_name(flight: Flight, source: str) -> str:
         return "none"
     if flight.odometry.source.startswith(MADE_FROM_FRAMES):
         return flight.odometry.source
-    if is_own_odometry(flight.folder):
-        method = json.loads((flight.folder / "odometry.json").read_text(encoding="utf-8"))["method"]
+    if method := own_method(flight.folder):
         return f"{MADE_FROM_FRAMES} by {MADE_BY}: {method}"
     return f"{source}: {flight.odometry.source or 'odometry'}"
 

@@ -154,6 +154,11 @@ def write_track(
     return section
 
 
+def write_facts(folder: Path, stem: str, facts: Mapping[str, Any]) -> None:
+    """Writes what is to be said of a track that was made from the flight's frames: ``stem``.json."""
+    files.write_text(folder / f"{stem}.json", json.dumps(facts, indent=1) + "\n")
+
+
 def name_track(folder: Path, section: Mapping[str, str], made_by: str) -> None:
     """Adds [odometry] to a flight.toml that has none: the keys that ``write_track`` gave, and who made it."""
     path = folder / "flight.toml"

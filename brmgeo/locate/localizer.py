@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from brmgeo.errors import InputError, SettingsError
 from brmgeo.files import digest_of
 from brmgeo.flight.camera import slant_gsd_m
+from brmgeo.flight.folder import mask_fault
 from brmgeo.flight.motion import RESET_SPEED_M_S, MotionSource, Pose
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.flight.values import Estimate, Motion, View
@@ -277,12 +278,8 @@ def _network(masks: Segmenter | None) -> dict[str, Any]:
 
 def _checked_mask(mask: NDArray[Any], name: str) -> NDArray[Any]:
     if mask.dtype == np.uint8:
-        other = (mask != 0) & (mask != 255)
-        if other.any():
-            row, col = np.argwhere(other)[0]
-            raise InputError(
-                f"{name}: pixel (row {row}, column {col}) is {mask[row, col]}: 0 is other, 255 is building, nothing else"
-            )
+        if fault := mask_fault(mask):
+            raise InputError(f"{name}: {fault}")
     elif mask.dtype not in (np.bool_, np.float32, np.float64) or ((mask < 0) | (mask > 1)).any():
         raise InputError(
             f"{name}: {mask.dtype} values: give bool, uint8 of 0 and 255, or float probability in [0, 1]"

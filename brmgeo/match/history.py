@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.codes import LABEL_BUILDING
 from brmgeo.errors import SettingsError
 from brmgeo.flight.values import Motion, View
 from brmgeo.match.smooth import Anchor
@@ -37,7 +38,7 @@ class PackedView:
     def of(view: View) -> PackedView:
         """The view, packed."""
         return PackedView(
-            building=np.rint(view.building * 255).astype(np.uint8),
+            building=np.rint(view.building * LABEL_BUILDING).astype(np.uint8),
             known=np.packbits(view.known),
             gsd_m=view.gsd_m,
             nadir_px=view.nadir_px,
@@ -50,7 +51,7 @@ class PackedView:
         shape, size = self.building.shape, self.building.size
         return View(
             t_s=t_s,
-            building=self.building.astype(np.float32) / np.float32(255),
+            building=self.building.astype(np.float32) / np.float32(LABEL_BUILDING),
             known=np.unpackbits(self.known, count=size).astype(np.bool_).reshape(shape),
             gsd_m=self.gsd_m,
             nadir_px=self.nadir_px,
