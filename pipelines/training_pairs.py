@@ -15,6 +15,7 @@ from brmgeo.region import TrainingSettings
 from brmgeo.segment import SPLITS
 from brmgeo.segment.pairs import read_pair
 from brmgeo.segment.shards import ShardWriter, TileInfo, entry_row
+from brmgeo.segment.survey import ground_facts, sampled
 from brmgeo.segment.tiles import Tally, pair_fault, shares
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
@@ -30,9 +31,7 @@ from .training_stages import (
     SURVEY_TILES,
     IndexSettings,
     SourceCredit,
-    ground_of,
     none_left,
-    sampled,
     surveyed,
     told_dropped,
     write_entries,
@@ -69,7 +68,7 @@ def run_pair_survey(inputs: Inputs, out: Path, settings: PairSurveySettings, map
     todo = [pairs[first : first + SURVEY_TILES] for first in range(0, len(pairs), SURVEY_TILES)]
     work = functools.partial(_survey_pairs, dict(inputs), replace(settings, pairs=()))
     found = [tile for some in map(work, todo) for tile in some]
-    ground = ground_of(found)
+    ground = ground_facts(found)
     facts = sampled(found, settings.empty_share, settings.seed) | {"ground": ground}
     if not facts["kept"]:
         hints = {

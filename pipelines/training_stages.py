@@ -21,7 +21,6 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from brmgeo.codes import LABEL_UNKNOWN
 from brmgeo.errors import InputError, SettingsError, listed
 from brmgeo.files import write_json
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice, shape_of
@@ -38,6 +37,7 @@ from brmgeo.segment.shards import (
     entry_row,
     write_index,
 )
+from brmgeo.segment.survey import ground_facts, label_offset, sampled
 from brmgeo.segment.tiles import (
     COARSE,
     Splits,
@@ -45,10 +45,9 @@ from brmgeo.segment.tiles import (
     cells,
     make_label,
     one_split,
-    picture_fault,
-    sample_empty,
     shares,
     spatial_splits,
+    tile_fault,
     tile_windows,
 )
 from brmgeo.workflow.stage import Json, Map, Stage, plain
@@ -134,28 +133,6 @@ def _block_offset(
     return block_offset(rgb, seen, _mask(inputs, own), gsd_m, search_m)
 
 
-@functools.lru_cache(maxsize=2)
-def _offsets(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """(n, 4) x, y, dx, dy of the blocks that tell; the region's (dx, dy), zero where it cannot tell; side of a block."""
-    text = json.loads((folder / "alignment.json").read_text(encoding="utf-8"))
-    told = [
-        ((b["bounds"][0] + b["bounds"][2]) / 2, (b["bounds"][1] + b["bounds"][3]) / 2, b["dx_m"], b["dy_m"])
-        for b in text["blocks"]
-        if b["status"] == "told"
-    ]
-    whole = text["region"]
-    own = (whole["dx_m"], whole["dy_m"]) if whole["status"] == "told" else (0.0, 0.0)
-    return np.array(told, dtype=np.float64).reshape(-1, 4), np.array(own), float(whole["block_m"])
-
-
-def label_offset(folder: Path, bounds: Bounds) -> tuple[float, float]:
-    """(dx, dy) in metres by which an ``alignment`` artifact moves the labels of a tile."""
-    from brmgeo.segment.alignment import offset_at
-
-    blocks, whole, side = _offsets(folder)
-    return offset_at(blocks, whole, side, bounds)
-
-
 # --- tile-survey: every tile that could be cut ------------------------------------------------------------------
 
 
@@ -223,7 +200,7 @@ def run_survey(inputs: Inputs, out: Path, settings: SurveySettings, map: Map) ->
     ]
     work = functools.partial(_survey_some, dict(inputs), settings)
     found = [tile for some in map(work, todo) for tile in some]
-    ground = ground_of(found)
+    ground = ground_facts(found)
     facts = sampled(found, settings.empty_share, settings.seed) | {
         "imagery_gsd_m": round(native, 4),
         "gsd_m": gsds,
@@ -247,23 +224,6 @@ def run_survey(inputs: Inputs, out: Path, settings: SurveySettings, map: Map) ->
     return facts
 
 
-def sampled(found: Sequence[Json], empty_share: float, seed: int) -> dict[str, Any]:
-    """Marks the tiles without buildings that are too many of a GSD and split; what then is kept and left out."""
-    for g, split in sorted({(t["gsd_m"], t["split"]) for t in found if not t["dropped"]}):
-        own = [t for t in found if t["gsd_m"] == g and t["split"] == split and not t["dropped"]]
-        empty = [t["key"] for t in own if t["built"] == 0]
-        kept = sample_empty(len(own) - len(empty), empty, empty_share, seed)
-        for tile in own:
-            if tile["built"] == 0 and tile["key"] not in kept:
-                tile["dropped"] = "empty"
-    dropped = Counter(t["dropped"] or "kept" for t in found)
-    return {
-        "candidates": len(found),
-        "kept": dropped.pop("kept", 0),
-        "dropped": dict(sorted(dropped.items())),
-    }
-
-
 def none_left(region: str, dropped: Mapping[str, int], hints: Mapping[str, str]) -> str:
     """The line for tiles that were all left out: how many for what reason, and the hint for the commonest."""
     most = max(dropped, key=lambda reason: dropped[reason], default="")
@@ -275,17 +235,6 @@ def told_dropped(dropped: Mapping[str, int]) -> str:
     """Such as "12 unknown, 3 without building", the commonest reason first."""
     common = sorted(dropped.items(), key=lambda item: -item[1])
     return ", ".join(f"{count} {LEFT_OUT.get(reason, reason)}" for reason, count in common)
-
-
-def ground_of(found: Sequence[Json]) -> Json:
-    """What the ground is like before tiles without buildings are sampled down, from the tiles with map and imagery."""
-    known = [t for t in found if t["known"] > 0 and t["dropped"] in (None, "guard")]
-    weight = sum(t["known"] for t in known)
-    return {
-        "tiles": len(known),
-        "empty": sum(t["built"] == 0 for t in known),
-        "building_share": round(sum(t["built"] * t["known"] for t in known) / weight, 6) if weight else None,
-    }
 
 
 def grid_at(box: GeoBox, gsd_m: float) -> GeoBox:
@@ -332,15 +281,10 @@ def _survey_some(
         coarse = Affine(a.a * COARSE, 0.0, a.c, 0.0, a.e * COARSE, a.f)
         small = GeoBox((window.height // COARSE, window.width // COARSE), coarse, grid.crs)
         rgb, seen = mosaic_to_lattice(_sources(inputs, settings.source), small)
-        told = seen & (blank_unknown(rgb, np.zeros(seen.shape, np.uint8), 2) != LABEL_UNKNOWN)
-        ground = told & (mask[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] == 0)
-        label = make_label(mask, np.repeat(np.repeat(told, COARSE, axis=0), COARSE, axis=1))
-        built, known = shares(label)
-        tile["built"], tile["known"] = round(built, 6), round(known, 6)
-        if known < settings.min_known_share or known == 0:
-            tile["dropped"] = "blank" if seen.any() and not told.any() else "unknown"
-        else:
-            tile["dropped"] = picture_fault(rgb, told, ground, settings.max_cloud_share)
+        (built, known), fault = tile_fault(
+            mask, rgb, seen, settings.min_known_share, settings.max_cloud_share
+        )
+        tile |= {"built": round(built, 6), "known": round(known, 6), "dropped": fault}
         if tile["dropped"] is None and tile["split"] is None:
             tile["dropped"] = "guard"
     return found

@@ -20,6 +20,7 @@ from brmgeo.codes import LABEL_BUILDING as BUILDING
 from brmgeo.codes import LABEL_OTHER as OTHER
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.geo.grid import Bounds, Window
+from brmgeo.segment.samples import blank_unknown
 
 COARSE = 8  # clouds are looked for in pixels this many times larger
 _BLANK_STD = 2.0  # grey levels: flat water keeps more than this at any GSD, a placeholder picture less
@@ -177,6 +178,33 @@ def picture_fault(
     rough = np.sqrt(np.maximum(_mean3(grey * grey) - _mean3(grey) ** 2, 0))
     cloud = (low >= _CLOUD_BRIGHT) & (high - low <= _CLOUD_COLOUR) & (rough <= _CLOUD_ROUGH) & ground
     return "cloudy" if cloud.sum() > cloud_share * ground.sum() else None
+
+
+def tile_fault(
+    mask: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
+    seen: NDArray[np.bool_],
+    min_known_share: float,
+    cloud_share: float,
+) -> tuple[tuple[float, float], str | None]:
+    """((share of building, share of known pixels) of a tile as ``shares``, why it is left out or None).
+
+    It is ``unknown`` where too little is known, ``blank`` and ``cloudy`` as ``picture_fault``; filler is not known.
+
+    Args:
+        mask: (h, w) uint8 building mask, 0, 1, 255 = outside the map; sides are multiples of COARSE.
+        rgb: (h / COARSE, w / COARSE, 3) uint8, the tile's picture in pixels COARSE times larger.
+        seen: (h / COARSE, w / COARSE) bool, where imagery is known.
+        min_known_share: the least share of known pixels.
+        cloud_share: the largest share of the ground that may be cloud.
+    """
+    told = seen & (blank_unknown(rgb, np.zeros(seen.shape, np.uint8), 2) != UNKNOWN)
+    label = make_label(mask, np.repeat(np.repeat(told, COARSE, axis=0), COARSE, axis=1))
+    built, known = shares(label)
+    if known < min_known_share or known == 0:
+        return (built, known), "blank" if seen.any() and not told.any() else "unknown"
+    ground = told & (mask[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] == 0)
+    return (built, known), picture_fault(rgb, told, ground, cloud_share)
 
 
 def pair_fault(image: NDArray[np.uint8], label: NDArray[np.uint8], cloud_share: float) -> str | None:

@@ -22,6 +22,7 @@ from brmgeo.segment.tiles import (
     sample_empty,
     shares,
     spatial_splits,
+    tile_fault,
     tile_windows,
 )
 
@@ -140,6 +141,23 @@ def test_blank_and_cloudy_pictures_are_found_and_white_roofs_are_not_clouds() ->
     roof = seen.copy()
     roof[:, :40] = False  # the same white, but the map says it is a building
     assert picture_fault(cloud, seen, roof) is None
+
+
+def test_a_tile_is_left_out_for_what_is_unknown_blank_or_cloudy() -> None:
+    rng = np.random.default_rng(6)
+    field = np.clip(rng.normal((110, 125, 80), 9, (16, 16, 3)), 0, 255).astype(np.uint8)
+    mask, seen = np.zeros((128, 128), np.uint8), np.ones((16, 16), bool)
+    mask[:, :32] = 1
+    assert tile_fault(mask, field, seen, 0.5, 0.5) == ((0.25, 1.0), None)
+    half = seen.copy()
+    half[:, 8:] = False
+    assert tile_fault(mask, field, half, 0.6, 0.5) == ((0.5, 0.5), "unknown")
+    assert tile_fault(np.full_like(mask, 255), field, seen, 0.0, 0.5) == ((0.0, 0.0), "unknown")
+    assert tile_fault(mask, np.zeros_like(field), seen, 0.5, 0.5) == ((0.0, 0.0), "blank")
+    cloud = np.clip(rng.normal(236, 3, (16, 16, 1)), 0, 254).astype(np.uint8).repeat(3, axis=2)
+    assert tile_fault(mask, cloud, seen, 0.5, 0.5) == ((0.25, 1.0), "cloudy")
+    mask[:] = 1  # the same white, but all of it is building
+    assert tile_fault(mask, cloud, seen, 0.5, 0.5) == ((1.0, 1.0), None)
 
 
 @given(st.integers(0, 400), st.integers(0, 400), st.floats(0, 1))
