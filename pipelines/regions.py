@@ -37,7 +37,7 @@ NGII = "https://map.ngii.go.kr"
 SHIPPED = Path(__file__).parents[1] / "data"
 
 _TEXT = """\
-# Region {name}: see data/regions/_template.toml for every key that a region can have.
+# Region {name}: see {template} for every key that a region can have.
 name = "{name}"
 title = {title}
 crs = "{crs}"                # {crs_note}
@@ -150,7 +150,7 @@ def new_region(
         right, top = max(e[2] for e in extents), max(e[3] for e in extents)
         note += f": x {left:.0f}..{right:.0f}, y {bottom:.0f}..{top:.0f}"
     else:
-        crs, placed = _in_metres(name, bounds, bounds_crs)
+        crs, placed = _in_metres(name, bounds, bounds_crs, data)
         if (placed[2] - placed[0]) * (placed[3] - placed[1]) > MAX_AREA_M2:
             raise SettingsError(
                 f"new region {name}: bounds {bounds} span {(placed[2] - placed[0]) / 1000:.0f} x "
@@ -163,6 +163,7 @@ def new_region(
         note = "the belt at this longitude"
     text = _TEXT.format(
         name=name,
+        template=shipped("regions/_template.toml", data),
         title=json.dumps(title or name, ensure_ascii=False),  # TOML's strings are JSON's
         crs=crs,
         crs_note=note,
@@ -179,7 +180,7 @@ def new_region(
     return path
 
 
-def _in_metres(name: str, bounds: Bounds, bounds_crs: str) -> tuple[str, Bounds]:
+def _in_metres(name: str, bounds: Bounds, bounds_crs: str, data: Path) -> tuple[str, Bounds]:
     """The belt's CRS and the bounds in it, widened to whole metres."""
     left, bottom, right, top = bounds
     if not all(map(math.isfinite, bounds)) or not (left < right and bottom < top):
@@ -191,14 +192,14 @@ def _in_metres(name: str, bounds: Bounds, bounds_crs: str) -> tuple[str, Bounds]
             raise SettingsError(
                 f"new region {name}: bounds {bounds} are not degrees; give --crs EPSG:... for bounds in metres"
             )
-        crs = _belt(name, (left + right) / 2)
+        crs = _belt(name, (left + right) / 2, data)
         left, bottom, right, top = transform_bounds(LONLAT, crs, bounds)
     else:
         require_projected_metres(bounds_crs)
         to_lonlat: Transformer = transformer(bounds_crs, LONLAT)
         lon, _ = to_lonlat.transform((left + right) / 2, (bottom + top) / 2)
         crs = crs_name(bounds_crs)
-        _belt(name, lon)
+        _belt(name, lon, data)
     return crs, (
         float(math.floor(left)),
         float(math.floor(bottom)),
@@ -207,13 +208,14 @@ def _in_metres(name: str, bounds: Bounds, bounds_crs: str) -> tuple[str, Bounds]
     )
 
 
-def _belt(name: str, lon_deg: float) -> str:
+def _belt(name: str, lon_deg: float, data: Path) -> str:
     try:
         return belt_for_lon(lon_deg)
     except CrsError:
         raise SettingsError(
             f"new region {name}: longitude {lon_deg:.2f} lies outside Korea (123-133 E), where NGII's sheets are; elsewhere "
-            "copy data/regions/_template.toml and state crs, bounds and paths yourself, or use brmgeo maps --footprints"
+            f"copy {shipped('regions/_template.toml', data)} and state crs, bounds and paths yourself, or use brmgeo maps "
+            "--footprints"
         ) from None
 
 

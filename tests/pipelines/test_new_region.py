@@ -64,6 +64,18 @@ def test_the_belt_follows_from_the_longitude(capsys: Capture, tmp_path: Path, lo
     assert region(tmp_path, "r").crs == crs
 
 
+def test_the_template_that_is_named_is_there(capsys: Capture, tmp_path: Path) -> None:
+    words = ("new-region", "r", "--data", tmp_path)
+    assert brmgeo(capsys, *words, "--sheets", "37807039").status == 0
+    written = (tmp_path / "regions" / "r.toml").read_text(encoding="utf-8")
+    assert f"see {REGIONS / '_template.toml'} for every key" in written
+    far = ("new-region", "far", "--data", tmp_path, "--bounds", "10,50,10.1,50.1")
+    assert f"copy {REGIONS / '_template.toml'} and" in brmgeo(capsys, *far).error
+    own = tmp_path / "regions" / "_template.toml"
+    own.touch()
+    assert f"copy {own} and" in brmgeo(capsys, *far).error
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
