@@ -14,7 +14,7 @@ from brmgeo.files import write_bytes, write_json
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.locate.masks import frame_gsd_m, frame_picture, stored_of
 from brmgeo.pictures import SUFFIXES, encode
-from brmgeo.segment.predict import Answer, Gsd, Picture, Segmenter, mask_of, read_image
+from brmgeo.segment.predict import Answer, Gsd, Picture, Segmenter, read_image, thresholded
 from brmgeo.workflow.progress import Progress
 
 SIGN = "masks.json"
@@ -124,7 +124,7 @@ def _segment_pictures(
     with Progress().stage("masks") as bar:
         for done, (job, name) in enumerate(zip(jobs, names, strict=True), start=1):
             probability = segmenter.probability(job.picture(), job.gsd_m)
-            mask = mask_of(probability, segmenter.card.threshold)
+            mask = thresholded(probability, segmenter.card.threshold)
             write_bytes(out / name, encode(mask if answer == "mask" else stored_of(probability)))
             share += float((mask > 0).mean()) / len(jobs)
             bar.update(done, len(jobs))

@@ -24,7 +24,7 @@ from brmgeo.files import digest_of, write_bytes
 from brmgeo.flight.camera import slant_gsd_m
 from brmgeo.flight.folder import Flight
 from brmgeo.pictures import decode, encode, read_bytes
-from brmgeo.segment.predict import Answer, Picture, Segmenter, mask_of, picture_of, read_image
+from brmgeo.segment.predict import Answer, Picture, Segmenter, picture_of, read_image, thresholded
 from brmgeo.segment.weights import ModelCard
 
 #: Probabilities as they are kept: 0 to 254 for 0 to 1, ``UNKNOWN`` for unknown.
@@ -206,7 +206,7 @@ def network_mask(
 def network_image(stored: NDArray[np.uint8], threshold: float | None) -> NDArray[Any]:
     """(h, w) of an answer as it is kept: uint8 0 or 255 by the threshold; without one, float32 probability."""
     probability = probability_of(stored)
-    return probability if threshold is None else mask_of(probability, threshold)
+    return probability if threshold is None else thresholded(probability, threshold)
 
 
 def frame_gsd_m(flight: Flight, index: int) -> float:

@@ -359,7 +359,7 @@ class Segmenter:
 
     def mask(self, image: NDArray[Any] | Picture, gsd_m: Gsd | None = None) -> U8:
         """(h, w) uint8: 255 where the probability is above the card's threshold, else (also where unknown) 0."""
-        return mask_of(self.probability(image, gsd_m), self.card.threshold)
+        return thresholded(self.probability(image, gsd_m), self.card.threshold)
 
     def _windows(self, rgb: U8) -> F32:
         """(n, h, w) probability of (n, h, w, 3) pictures of any one size."""
@@ -413,7 +413,7 @@ def _placed(answer: F32, picture: Picture) -> F32:
     return np.where(picture.known, answer, np.float32(np.nan))
 
 
-def mask_of(probability: F32, threshold: float) -> U8:
+def thresholded(probability: F32, threshold: float) -> U8:
     """(h, w) uint8: 255 where ``probability`` is above ``threshold``, else, and where it is NaN, 0."""
     with np.errstate(invalid="ignore"):
         return np.where(probability > threshold, LABEL_BUILDING, LABEL_OTHER).astype(np.uint8)

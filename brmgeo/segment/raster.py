@@ -32,9 +32,9 @@ from brmgeo.segment.predict import (
     Answer,
     Picture,
     Segmenter,
-    mask_of,
     picture_of,
     spans,
+    thresholded,
 )
 
 _BLOCK_PX = 512
@@ -222,7 +222,7 @@ def open_raster(
 
 def codes_of(probability: NDArray[np.float32], threshold: float) -> NDArray[np.uint8]:
     """(h, w) uint8 of the maps' codes: building above ``threshold``, unknown where NaN, other elsewhere."""
-    building = mask_of(probability, threshold) > 0
+    building = thresholded(probability, threshold) > 0
     return np.where(np.isnan(probability), UNKNOWN, np.where(building, BUILDING, OTHER)).astype(np.uint8)
 
 

@@ -20,7 +20,7 @@ from small_networks import bright_onnx, small_card, small_tensors
 
 from brmgeo.errors import InputError, MissingExtraError, MissingInputError, SettingsError
 from brmgeo.segment import predict
-from brmgeo.segment.predict import Segmenter, mask_of, picture_of, read_image, spans
+from brmgeo.segment.predict import Segmenter, picture_of, read_image, spans, thresholded
 from brmgeo.segment.weights import save_weights
 
 
@@ -220,7 +220,7 @@ def test_grey_is_repeated_in_all_channels(segmenter: Segmenter) -> None:
 
 def test_mask_is_above_the_threshold() -> None:
     p = np.array([[0.0, 0.44, 0.46, np.nan, 1.0]], np.float32)
-    assert mask_of(p, 0.45).tolist() == [[0, 0, 255, 0, 255]]
+    assert thresholded(p, 0.45).tolist() == [[0, 0, 255, 0, 255]]
 
 
 def test_onnx_runtime_and_its_card_need_no_torch(tmp_path: Path) -> None:
