@@ -128,6 +128,7 @@ main()
     assert "buildings" in done.stdout
 
 
+@pytest.mark.slow  # kernels are compiled anew where the wheel is unpacked
 def test_the_installed_command_locates_as_the_checkout_does(
     installed: Path, maps: Path, whole: Path, results: Path, tmp_path: Path
 ) -> None:
