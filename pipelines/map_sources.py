@@ -28,6 +28,7 @@ from .regions import where_to_get
 
 if TYPE_CHECKING:
     from brmgeo.ingest.imagery import ImagerySource
+    from brmgeo.ingest.tiles import MBTiles, TileFolder
 
 RASTER_SUFFIXES = (".tif", ".tiff", ".vrt", ".jpg", ".jpeg", ".png", ".jp2", ".img")
 VECTOR_SUFFIXES = (".dxf", ".shp", ".gpkg", ".geojson", ".json", ".parquet", ".fgb")
@@ -164,15 +165,9 @@ class ImageryFiles:
 def imagery_sources(source: ImageryFiles, root: Path) -> list[ImagerySource]:
     """The adapters of an imagery source over local files below ``root``."""
     from brmgeo.ingest.imagery import GeoRaster, NgiiOrtho
-    from brmgeo.ingest.tiles import MBTiles, TileFolder
 
-    if source.kind in ("tiles", "service"):
-        assert source.level is not None
-        folder = root / source.member if source.member else root
-        grid = grid_named(source.grid)
-        return [TileFolder(folder, grid, source.level, source.template, pixel_ratio=source.pixel_ratio)]
-    if source.kind == "mbtiles":
-        return [MBTiles.open(root, source.level, source.pixel_ratio)]
+    if source.kind != "raster":
+        return [tile_source(source, root)]
     found: list[ImagerySource] = []
     for path in (root / name for name in source.files):
         number = sheet_number_in(path.name)
@@ -181,6 +176,19 @@ def imagery_sources(source: ImageryFiles, root: Path) -> list[ImagerySource]:
         else:
             found.append(GeoRaster(path, crs=source.crs, bands=source.bands, value_range=source.value_range))
     return found
+
+
+def tile_source(source: ImageryFiles, root: Path) -> MBTiles | TileFolder:
+    """The tiles of an imagery source that is no raster, below ``root``."""
+    from brmgeo.ingest.tiles import MBTiles, TileFolder
+
+    if source.kind == "mbtiles":
+        return MBTiles.open(root, source.level, source.pixel_ratio)
+    assert source.level is not None
+    folder = root / source.member if source.member else root
+    return TileFolder(
+        folder, grid_named(source.grid), source.level, source.template, pixel_ratio=source.pixel_ratio
+    )
 
 
 def _is_placed(path: Path) -> bool:
@@ -221,18 +229,11 @@ def imagery_inputs(
             f"{'a folder of tiles' if given.kind == 'tiles' else 'the MBTiles file'} there (grid {given.grid}, level "
             f"{given.level}{_tile_range(region, given)}), or take [imagery] out of the region file"
         )
-    from brmgeo.ingest.tiles import MBTiles, TileFolder, TileSource, ensure_tiles
+    from brmgeo.ingest.tiles import ensure_tiles
 
-    source: TileSource
-    if given.kind == "mbtiles":
-        source = MBTiles.open(path, given.level, given.pixel_ratio)
-    else:
-        assert given.level is not None
-        source = TileFolder(
-            path, grid_named(given.grid), given.level, given.template, pixel_ratio=given.pixel_ratio
-        )
-    ensure_tiles(source, place_of(region), region.crs, missing_ok=given.missing_share)
-    return {"imagery": path}, ImageryFiles.of(given)
+    source = ImageryFiles.of(given)
+    ensure_tiles(tile_source(source, path), place_of(region), region.crs, missing_ok=given.missing_share)
+    return {"imagery": path}, source
 
 
 def _tile_range(region: MapSettings, given: ImagerySettings) -> str:

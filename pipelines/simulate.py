@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -20,6 +19,7 @@ from brmgeo.synth.flight import OdometryErrors, SimulationSettings, read_simulat
 from brmgeo.synth.mission import FineImagery, flight_path, imagery_along, read_ground, simulator_settings
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
+from brmgeo.workflow.stage import Json, canonical, plain
 
 from .maps import native_imagery
 from .regions import town_style
@@ -158,6 +158,17 @@ def other_day(own: Region, maps_dir: Path, season: str, seed: int, out: Path) ->
     return out
 
 
+@dataclass(frozen=True, slots=True)
+class _DefaultFlight:
+    """What a default flight depends on: its seed, what is drawn, the region's settings and its footprints' digest."""
+
+    seed: int
+    mode: Mode
+    flight: Mapping[str, Json]
+    imagery: Mapping[str, Json] | None
+    footprints: str
+
+
 def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
     """The flight that is simulated when none is given: the paper's rectangle, made once a seed.
 
@@ -168,14 +179,16 @@ def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
     out = data / "source" / own.name / "flights" / name
     maps = read_maps(maps_dir.absolute())
     mode: Mode = "frames" if maps.imagery is not None else "masks"
-    recipe = json.dumps(
-        {
-            "seed": seed,
-            "mode": mode,
-            "flight": own.flight.model_dump(),
-            "imagery": None if own.imagery is None else own.imagery.model_dump(mode="json"),
-            "footprints": "" if maps.footprints is None else digest(maps.footprints),
-        }
+    recipe = canonical(
+        plain(
+            _DefaultFlight(
+                seed=seed,
+                mode=mode,
+                flight=own.flight.model_dump(),
+                imagery=None if own.imagery is None else own.imagery.model_dump(mode="json"),
+                footprints="" if maps.footprints is None else digest(maps.footprints),
+            )
+        )
     )
     note = out / ".recipe.json"
     if not note.is_file() or note.read_text(encoding="utf-8") != recipe:

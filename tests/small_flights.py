@@ -6,6 +6,9 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import click
+from click.testing import CliRunner
+
 from brmgeo.synth.flight import MaskErrors, OdometryErrors, SimulationSettings
 from pipelines.cli import cli, run
 
@@ -53,3 +56,16 @@ def edit(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text, (path, old)
     path.write_text(text.replace(old, new, 1))
+
+
+def command(*arguments: object) -> tuple[int, str]:
+    """Exit status and what was printed, as the command ``brmgeo`` would have it."""
+    status = -1
+
+    def whole() -> None:
+        nonlocal status
+        status = run(lambda: cli([str(a) for a in arguments], standalone_mode=False))
+
+    result = CliRunner().invoke(click.Command("brmgeo", callback=whole))
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return status, result.output

@@ -86,8 +86,6 @@ def read_footprints(
     encoding: str | None = None,
     layers: Sequence[str] = BUILDING_LAYERS,
     sheet: str | None = None,
-    kind_column: str | None = None,
-    floors_column: str | None = None,
     snap_m: float = SNAP_M,
     max_dropped_share: float = MAX_DROPPED_SHARE,
 ) -> Footprints:
@@ -101,8 +99,9 @@ def read_footprints(
         encoding: of a shapefile's attributes; None takes its .cpg, else EUC-KR, as NGII's are.
         layers: DXF layers that are buildings.
         sheet: the sheet number; None looks for one in the names of the file and its folder.
-        kind_column, floors_column: attribute columns; None takes kind or 종류, floors or 층수 where present.
         snap_m, max_dropped_share: see ``dxf.read_dxf``.
+
+    Kinds are in a column kind or 종류, floors in floors or 층수, where there are such.
 
     Vertices are transformed one by one, none added or moved. Raises MissingInputError, InputError, and CrsError for
     coordinates that do not lie where the sheet number puts them, with the distance that it would cost (see
@@ -120,8 +119,6 @@ def read_footprints(
         layer=layer,
         encoding=encoding,
         sheet=sheet,
-        kind_column=kind_column,
-        floors_column=floors_column,
         snap_m=snap_m,
         max_dropped_share=max_dropped_share,
     )
@@ -321,8 +318,6 @@ def _from_vector(
     layer: str | None,
     encoding: str | None,
     sheet: str | None,
-    kind_column: str | None,
-    floors_column: str | None,
     snap_m: float,
     max_dropped_share: float,
 ) -> Footprints:
@@ -370,8 +365,8 @@ def _from_vector(
         if not number and path.name.upper().startswith("N3A_"):
             number = _cell_around((left, bottom, right, top), target)
     from_row = row[repaired.origin]
-    kinds = _kinds(frame, kind_column, path)[from_row]
-    floors = _floors(frame, floors_column, path).iloc[from_row].array
+    kinds = _kinds(frame)[from_row]
+    floors = _floors(frame).iloc[from_row].array
     columns = {
         "layer": np.full(len(from_row), name, dtype=object),
         "kind": kinds,
@@ -558,19 +553,13 @@ def _cell_around(bounds: Bounds, crs: str) -> str:
     return number
 
 
-def _column(frame: gpd.GeoDataFrame, asked: str | None, usual: Sequence[str], path: Path) -> str | None:
+def _column(frame: gpd.GeoDataFrame, usual: Sequence[str]) -> str | None:
     names = {str(name).casefold(): str(name) for name in frame.columns}
-    if asked is not None:
-        if asked.casefold() not in names:
-            raise InputError(
-                f"{path.name}: has no column {asked!r}; there are {', '.join(map(str, frame.columns))}"
-            )
-        return names[asked.casefold()]
     return next((names[name] for name in usual if name in names), None)
 
 
-def _kinds(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> NDArray[np.object_]:
-    column = _column(frame, asked, _KIND_COLUMNS, path)
+def _kinds(frame: gpd.GeoDataFrame) -> NDArray[np.object_]:
+    column = _column(frame, _KIND_COLUMNS)
     out = np.full(len(frame), "", dtype=object)
     if column is not None:
         for i, value in enumerate(frame[column].tolist()):
@@ -579,8 +568,8 @@ def _kinds(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> NDArray[np
     return out
 
 
-def _floors(frame: gpd.GeoDataFrame, asked: str | None, path: Path) -> pd.Series[Any]:
-    column = _column(frame, asked, _FLOOR_COLUMNS, path)
+def _floors(frame: gpd.GeoDataFrame) -> pd.Series[Any]:
+    column = _column(frame, _FLOOR_COLUMNS)
     if column is None:
         return pd.Series([pd.NA] * len(frame), dtype="Int32")
     numbers = pd.to_numeric(

@@ -190,11 +190,6 @@ class Store:
                 wrong.append(f"{artifact.path / name}: not in the record")
         return wrong
 
-    def remove(self, artifact: Artifact) -> None:
-        """Takes an artifact out of the store, so that the next run makes it again."""
-        with self._workdir() as work, disk_errors(f"removing {artifact.path}", self.root):
-            os.rename(artifact.path, work / "old")
-
     def build(self, step: Step[Any], map: Map) -> Artifact:
         """The artifact of a step: the finished one at once, otherwise its inputs are built and then its stage runs.
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from log_writers import (
     ENU_FROM_FLU,
     LAT0,
@@ -22,40 +21,24 @@ from log_writers import (
     px4,
     turn_between,
 )
+from small_flights import command
 
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.logs.inspect import inspect
-from pipelines import cli
 
 pytest.importorskip("rosbags")
 pytest.importorskip("pyulog")
 pytest.importorskip("pymavlink")
 
 
-def run(*arguments: object) -> tuple[int, str]:
-    """Exit status and what was printed, as the command ``brmgeo`` would have it."""
-    runner = CliRunner()
-    status = -1
-
-    def whole() -> None:
-        nonlocal status
-        status = cli.run(lambda: cli.cli([str(a) for a in arguments], standalone_mode=False))
-
-    import click
-
-    result = runner.invoke(click.Command("brmgeo", callback=whole))
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return status, result.output
-
-
 def good(out: Path, *arguments: object) -> Flight:
-    status, said = run("import", *arguments, "--out", out)
+    status, said = command("import", *arguments, "--out", out)
     assert status == 0, said
     return read_flight(out)
 
 
 def refused(out: Path, *arguments: object) -> str:
-    status, said = run("import", *arguments, "--out", out)
+    status, said = command("import", *arguments, "--out", out)
     assert status == 2, said
     assert said.startswith("brmgeo: ")
     assert said.count("\n") == 1, "one line"
@@ -126,7 +109,7 @@ def test_a_px4_log_and_its_photos_become_a_whole_flight(tmp_path: Path) -> None:
     assert int(np.flatnonzero(np.diff(segment))[0]) == 199
     assert (
         "GNSS went into this odometry"
-        in run("import", log, "--photos", photos, "--out", tmp_path / "again")[1]
+        in command("import", log, "--photos", photos, "--out", tmp_path / "again")[1]
     )
     extra = photo(photos / "DSC0099.JPG", time="2024:05:06 10:20:55")
     assert "7 camera triggers for 8 photos" in refused(tmp_path / "c", log, "--photos", photos)
@@ -176,7 +159,7 @@ def test_text_needs_no_library_and_its_body_can_be_turned(tmp_path: Path) -> Non
     said = refused(tmp_path / "a", path)
     assert "its +x axis points up" in said
     assert "body_deg 0,-90,0" in said
-    status, _ = run("import", path, "--out", tmp_path / "b", "--body", "0,-90,0")
+    status, _ = command("import", path, "--out", tmp_path / "b", "--body", "0,-90,0")
     assert status == 0
     from brmgeo.flight.odometry import read_odometry
 
@@ -192,7 +175,7 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     )
     gravity = bag(tmp_path / "g", "mcap", imu_scale=(1.0, 1 / 9.80665), topics=("odom", "imu"))
     assert "it is in g, not m/s2: give imu_units g (--imu-units TEXT)" in refused(tmp_path / "c", gravity)
-    assert run("import", gravity, "--out", tmp_path / "d", "--imu-units", "g")[0] == 0
+    assert command("import", gravity, "--out", tmp_path / "d", "--imu-units", "g")[0] == 0
     for path, word in ((late, "synchronised"), (degrees, "deg/s"), (gravity, "it is in g")):
         assert any(word in line for line in inspect(path) if line.startswith("  FAULT"))
 
@@ -202,14 +185,14 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     order = tmp_path / "o.tum"
     order.write_text("\n".join(" ".join(f"{v:.9f}" for v in (t, *p, *q)) for t, p, q in zip(T, XYZ, WXYZ)))
     assert 'look like wxyz: give quaternion = "wxyz"' in refused(tmp_path / "f", order)
-    assert run("import", order, "--out", tmp_path / "n", "--quaternion", "wxyz")[0] == 0
+    assert command("import", order, "--out", tmp_path / "n", "--quaternion", "wxyz")[0] == 0
     assert any("look like wxyz" in line for line in inspect(order) if line.startswith("  FAULT"))
 
     two = bag(tmp_path / "two", "mcap", topics=("odom",), twice=True)
     assert "choose one of /vins/odometry (400), /other/odometry (400) (--topic TEXT)" in refused(
         tmp_path / "h", two
     )
-    assert "is there already" in run("import", order, "--out", tmp_path / "n")[1]
+    assert "is there already" in command("import", order, "--out", tmp_path / "n")[1]
     assert "--imu-units 'furlong' is unknown" in refused(tmp_path / "i", order, "--imu-units", "furlong")
     assert "--camera has 3 numbers" in refused(tmp_path / "j", order, "--camera", "1,2,3")
     images = bag(tmp_path / "images", "mcap", topics=("odom", "image"))
@@ -223,8 +206,8 @@ def test_kitti_needs_times(tmp_path: Path) -> None:
     path.write_text("\n".join(f"1 0 0 {0.5 * i} 0 1 0 0 0 0 1 0" for i in range(30)))
     assert "30 poses for no frames" in refused(tmp_path / "a", path)
     times.write_text("\n".join(f"{0.1 * i:.3e}" for i in range(30)))
-    assert run("import", path, "--times", times, "--out", tmp_path / "b")[0] == 0
-    status, said = run("inspect", path, "--times", times)
+    assert command("import", path, "--times", times, "--out", tmp_path / "b")[0] == 0
+    status, said = command("inspect", path, "--times", times)
     assert status == 0
     assert "30 in 2.9 s, 10.0 Hz" in said
 
@@ -247,10 +230,10 @@ def test_inspect_tells_what_is_in_a_log(tmp_path: Path) -> None:
     said = "\n".join(inspect(tmp_path / "flight"))
     assert "flight folder 'log'" in said
     (tmp_path / "words.txt").write_text("no log\n")
-    status, said = run("inspect", tmp_path / "words.txt", tmp_path / "log.ulg")
+    status, said = command("inspect", tmp_path / "words.txt", tmp_path / "log.ulg")
     assert status == 2
     assert "vehicle_local_position" in said
     assert "1 of 2 paths could not be read" in said
     document = tmp_path / "logs.md"
-    assert run("inspect", tmp_path / "log.ulg", tmp_path / "flight", "--write", document)[0] == 0
+    assert command("inspect", tmp_path / "log.ulg", tmp_path / "flight", "--write", document)[0] == 0
     assert document.read_text().count("\n## ") == 2

@@ -88,15 +88,12 @@ def test_one_town_through_every_format_and_crs(tmp_path, name, crs):
     assert read.frame.area.sum() == pytest.approx(frame.area.sum(), rel=1e-6)
 
 
-def test_attributes_of_your_own(tmp_path):
-    frame = town(4).rename(columns={"종류": "use", "층수": "storeys"})
-    frame["storeys"] = ["3층", None, "x", "12"]
-    path = write(frame, tmp_path / "t.gpkg")
-    read = read_footprints(path, CRS, kind_column="use", floors_column="storeys")
+def test_floors_are_read_out_of_text(tmp_path):
+    frame = town(4).rename(columns={"종류": "Kind"})
+    frame["층수"] = ["3층", None, "x", "12"]
+    read = read_footprints(write(frame, tmp_path / "t.gpkg"), CRS)
     assert list(read.frame.kind) == ["apartment", "house", "wall-less", "greenhouse"]
     assert read.frame.floors.fillna(-1).tolist() == [3, -1, -1, 12]
-    with pytest.raises(InputError, match=r"has no column 'art'; there are use, storeys"):
-        read_footprints(path, CRS, kind_column="art")
 
 
 def test_faults_are_repaired_and_told(tmp_path):

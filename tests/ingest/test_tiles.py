@@ -158,7 +158,7 @@ def test_rate_and_connections_are_bounded(tmp_path: Path) -> None:
 
 
 def test_a_dead_service_is_left_alone(tmp_path: Path) -> None:
-    """Nobody listens, or all fails: we stop after a few tiles in a row (one more may be on its way) instead of hammering on."""
+    """Nobody listens, or all fails: we stop after a few tiles in a row (one more may be on its way), and hammer no more."""
     with tile_server(lambda p, n: "500") as server:
         with pytest.raises(NetworkError, match=r"12 of 12 .*not asked for after [34] failures in a row"):
             fill(service(server, tmp_path / "a", retries=1, give_up_after=3, max_connections=1))

@@ -6,12 +6,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import ExifTags, Image
+from small_flights import command
 
 from brmgeo import files
 from brmgeo.flight.folder import Flight, read_flight
@@ -22,7 +21,7 @@ from brmgeo.flight.values import Motion
 from brmgeo.geo.crs import transformer
 from brmgeo.locate.localizer import usual_reset_speed_m_s
 from brmgeo.match import MatchSettings, OdometrySettings
-from pipelines import cli, odometry
+from pipelines import odometry
 
 TOML = """name = "small"
 [camera]
@@ -67,19 +66,6 @@ def test_a_fast_aircraft_is_no_reset_where_its_speed_is_allowed(folder: Path) ->
     slow = replace(flight, odometry=track(30.0))
     # A low bound is of movement without odometry: the track itself is believed up to what aircraft fly.
     assert all(m.step_m is not None for m in motions_of(slow, 8.0)[1:])
-
-
-def command(*arguments: object) -> tuple[int, str]:
-    """Exit status and what was printed, as the command ``brmgeo`` would have it."""
-    status = -1
-
-    def whole() -> None:
-        nonlocal status
-        status = cli.run(lambda: cli.cli([str(a) for a in arguments], standalone_mode=False))
-
-    result = CliRunner().invoke(click.Command("brmgeo", callback=whole))
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return status, result.output
 
 
 def poses(path: Path, topic: float = 1.0) -> Path:

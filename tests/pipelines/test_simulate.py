@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from small_flights import Said, bytes_of
+from small_flights import CRS, LEFT, TOP, Said, bytes_of
 
 from brmgeo.errors import SettingsError
 from brmgeo.flight.folder import read_flight
-from brmgeo.region import FlightSettings, Region
+from brmgeo.region import Region
 from pipelines import simulate as job
 
 
@@ -82,7 +82,7 @@ def test_the_flight_that_localize_makes_has_a_name_of_its_own(
 
     monkeypatch.setattr(job, "simulate_flight", simulate)
     monkeypatch.setattr(job, "native_imagery", lambda *_: None)
-    region = Region.model_construct(name="r", flight=FlightSettings(), imagery=None)
+    region = Region(name="r", crs=CRS, bounds=(LEFT, TOP - 500.0, LEFT + 600.0, TOP))
     assert job.default_flight(region, maps, tmp_path, 1) == made[0][0]
     # brmgeo simulate calls its own flights simulated-SEED.
     assert [name for _, name in made] == ["default-1"] == [made[0][0].name]

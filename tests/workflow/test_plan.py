@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -146,7 +147,7 @@ def test_why_names_the_sources_that_changed(tmp_path: Path, source: Path) -> Non
 def test_why_of_removed_and_damaged_artifacts(tmp_path: Path, source: Path) -> None:
     plan = toys.toy_plan(tmp_path / "store", source)
     made = plan.build()
-    plan.store.remove(made["words"])
+    shutil.rmtree(made["words"].path)
     (made["squares"].path / "squares.txt").write_text("0")
     assert states(plan) == ["missing", "damaged"]
     assert "its outputs were removed from the store" in plan.why("words")[1]
