@@ -337,6 +337,16 @@ def _row_house(rng: np.random.Generator, p: Point, angle: float, plan: TownPlan)
     return w + float(rng.uniform(5, 9))
 
 
+def _wander(rng: np.random.Generator, x: float, y: float, heading: float, length: float) -> LineString:
+    """A lane from a point that turns a little every 14 m."""
+    points = [(x, y)]
+    for _ in range(int(length / 14)):
+        heading += rng.normal(0, 0.16)
+        x, y = x + 14 * math.cos(heading), y + 14 * math.sin(heading)
+        points.append((x, y))
+    return LineString(points)
+
+
 def make_village(
     x: float,
     y: float,
@@ -350,24 +360,16 @@ def make_village(
     face = rng.normal(0, 0.3)
     direction = rng.uniform(0, math.pi)
     lanes: list[LineString] = []
-
-    def wander(px: float, py: float, heading: float, length: float) -> LineString:
-        points = [(px, py)]
-        for _ in range(int(length / 14)):
-            heading += rng.normal(0, 0.16)
-            px, py = px + 14 * math.cos(heading), py + 14 * math.sin(heading)
-            points.append((px, py))
-        return LineString(points)
-
     half = float(rng.uniform(80, 150))
-    first = wander(x, y, direction, half)
-    second = wander(x, y, direction + math.pi, half)
+    first = _wander(rng, x, y, direction, half)
+    second = _wander(rng, x, y, direction + math.pi, half)
     main = LineString([*list(second.coords)[::-1], *list(first.coords)[1:]])
     lanes.append(main)
     for _ in range(int(rng.integers(3, 7))):
         p = main.interpolate(float(rng.uniform(0.05, 0.95)), normalized=True)
         lanes.append(
-            wander(
+            _wander(
+                rng,
                 p.x,
                 p.y,
                 direction + float(rng.choice([-1, 1])) * rng.uniform(1.2, 1.9),
