@@ -36,6 +36,7 @@ def frames_of(flight: Path) -> list[str]:
     return [frame.file for frame in read_flight(flight).frames]
 
 
+@pytest.mark.slow
 def test_localize_runs_the_network_where_there_are_no_masks(
     maps: Path, pictured: Path, weights: Path, tmp_path: Path, say: Say, asked: list
 ) -> None:

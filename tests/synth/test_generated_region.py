@@ -54,6 +54,7 @@ def test_files_are_the_same_from_one_process_and_from_two(tmp_path: Path) -> Non
     assert list(manifest["sheets"]) == list(SHEETS)
 
 
+@pytest.mark.slow
 def test_sheets_do_not_depend_on_the_order_of_sets(tmp_path: Path) -> None:
     # Python draws the order of sets of text anew in every process: these two seeds order DXF classes differently.
     script = (
