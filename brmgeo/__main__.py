@@ -9,7 +9,7 @@ import importlib
 
 
 def main() -> None:
-    """Run the command line; it exits with 0, 2 for a known error, 130 when interrupted."""
+    """Run the command line; it exits with 0, 2 for a known error, 70 for a defect, 130 when interrupted."""
     try:
         cli = importlib.import_module("brmgeo.pipelines.cli")
     except ModuleNotFoundError as error:

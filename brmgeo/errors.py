@@ -1,7 +1,7 @@
 """The errors a user can meet: one root, a handful of kinds.
 
 A message is one line that says what was asked, what was found, where, and what to do. The command line
-prints it and leaves with exit status 2; every other exception is a defect of brmgeo and keeps its traceback.
+prints it and leaves with exit status 2; every other exception is a defect of brmgeo (exit status 70).
 
 The library knows no command line. Where a parameter would mend the fault, ``needs`` names it as the called function does
 (such as ``source_crs``), and a command line says which of its options that is.

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, what a disk says in words, digests, and a lock on any system."""
+"""Files and folders that appear whole or not at all, JSON, what a disk says in words, digests, and a lock on any system."""
 
 from __future__ import annotations
 
@@ -110,9 +110,46 @@ def write_json(path: Path, value: Any, *, durable: bool = False) -> None:
 def read_json(path: Path) -> Any | None:
     """The JSON in a file, or None when it is absent or damaged."""
     try:
-        return json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))
+        return json_of(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
+
+
+#: Tables and lists are nested this deep at most.
+DEEPEST = 32
+
+
+def json_of(text: str | bytes) -> Any:
+    """The value of JSON text (bytes: UTF-8, a byte order mark allowed, names that are no UTF-8 keep their bytes).
+
+    Raises ValueError for all that cannot be read, nesting beyond ``DEEPEST`` too: what is nested 100 000 deep can be
+    neither parsed nor written again.
+    """
+    if isinstance(text, bytes):
+        text = text.decode("utf-8-sig", errors="surrogateescape")
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError(f"lists are nested more than {DEEPEST} deep") from None
+    if is_deep(value):
+        raise ValueError(f"lists are nested more than {DEEPEST} deep")
+    return value
+
+
+def is_deep(value: Any) -> bool:
+    """True where dicts and lists are nested more than ``DEEPEST`` deep."""
+    level = [value]
+    for _ in range(DEEPEST + 1):
+        level = [
+            v
+            for group in level
+            if isinstance(group, dict | list)
+            for v in (group.values() if isinstance(group, dict) else group)
+            if isinstance(v, dict | list)
+        ]
+        if not level:
+            return False
+    return True
 
 
 @contextlib.contextmanager

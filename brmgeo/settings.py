@@ -22,13 +22,11 @@ from typing import Any, TypeGuard, TypeVar
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from brmgeo.errors import BrmgeoError, MissingInputError, SettingsError
-from brmgeo.files import told
+from brmgeo.files import DEEPEST, is_deep, told
 
 T = TypeVar("T")
 Keys = tuple[str | int, ...]
 
-#: Tables and lists within each other, at most.
-DEEPEST = 32
 _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 _TOLD = 3
 
@@ -137,7 +135,7 @@ def read_toml(
         raise error(f"{path}:{line}: not valid TOML: a number has too many digits") from None
     except RecursionError:
         raise error(f"{path}:{_line_of_depth(text)}: {deep}") from None
-    if _is_deep(data):
+    if is_deep(data):
         raise error(f"{path}:{_line_of_depth(text)}: {deep}")
     places = {}
     for keys, offset in _Scan(text).places().items():
@@ -145,17 +143,6 @@ def read_toml(
         column = offset - (text.rfind("\n", 0, offset) + 1) + 1
         places[_named(data, keys)] = (path, line, column)
     return Toml(path, text, data, error, places)
-
-
-def _is_deep(data: Any) -> bool:
-    level = [data]
-    for _ in range(DEEPEST + 1):
-        level = [
-            v for d in level for v in (d.values() if isinstance(d, dict) else d) if isinstance(v, dict | list)
-        ]
-        if not level:
-            return False
-    return True
 
 
 def _line_of_depth(text: str) -> int:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,15 @@ from typing import Any
 import click
 
 from brmgeo import __version__, extras, files
-from brmgeo.errors import BrmgeoError, SettingsError
+from brmgeo.errors import BrmgeoError, SettingsError, one_line
 
 DATA = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=True, path_type=Path)
 METHODS = ("mask", "ratio", "paper")
 SEASONS = ("spring", "summer", "autumn", "winter")
+TRACEBACK = "--traceback"
+#: EX_SOFTWARE of sysexits.h: a defect of brmgeo.
+DEFECT = 70
 data_option = click.option(
     "--data",
     type=DATA,
@@ -71,6 +76,11 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
 class _Command(click.Command):
     """A command that says which of its options mends an error whose ``needs`` names a parameter."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # The last door reads it; here it is only allowed, before and after the command's name.
+        self.params.append(click.Option([TRACEBACK], is_flag=True, expose_value=False, hidden=True))
+
     def invoke(self, ctx: click.Context) -> Any:
         """As click's own, with the option named in the message."""
         try:
@@ -97,6 +107,12 @@ class _Group(click.Group):
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="brmgeo")
+@click.option(
+    TRACEBACK,
+    is_flag=True,
+    expose_value=False,
+    help="Show where an unexpected error comes from, for a report.",
+)
 def cli() -> None:
     """Tell a drone where it is, without GNSS, from free building maps."""
 
@@ -1071,11 +1087,39 @@ def odometry(flight: Path, method: str, thin: Path | None, every_s: float) -> No
 
 def main() -> None:
     """Entry point of the ``brmgeo`` command."""
-    sys.exit(run(lambda: cli(standalone_mode=False)))
+    sys.exit(last_door(lambda: cli(standalone_mode=False), sys.argv[1:]))
+
+
+def last_door(command: Callable[[], Any], words: Sequence[str]) -> int:
+    """``run`` for people: what still escapes it is a defect, told in one line with how to report it, and exit status 70.
+
+    ``words`` are those of the command line; ``--traceback`` among them shows where the error comes from.
+    """
+    # A message with a name that this terminal cannot write must not become an error of its own.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        return run(command)
+    except Exception as error:
+        if TRACEBACK in words:
+            traceback.print_exc()
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}:{place.lineno}"
+        asked = "the lines above" if TRACEBACK in words else f"what the same command says with {TRACEBACK}"
+        click.echo(
+            f"brmgeo: a defect of brmgeo {__version__} in {where}: {type(error).__name__}: {one_line(error)}; please report "
+            f"this line, the command and {asked} to its maintainers",
+            err=True,
+        )
+        return DEFECT
 
 
 def run(command: Callable[[], Any]) -> int:
-    """Exit status of a command: 0, 2 for a known error (one line on stderr), 130 when interrupted."""
+    """Exit status of a command: 0, 2 for a known error (one line on stderr), 130 when interrupted, 141 for a closed pipe.
+
+    Any other exception is a defect, and passes.
+    """
     try:
         command()
     except BrmgeoError as error:
@@ -1099,6 +1143,13 @@ def run(command: Callable[[], Any]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except MemoryError as error:
+        click.echo(
+            f"brmgeo: the memory of this machine is not enough ({one_line(error)}): give a smaller area or picture, "
+            "or close other programs",
+            err=True,
+        )
+        return 2
     except ModuleNotFoundError as error:
         line = extras.told(error, "this command")
         if line is None:

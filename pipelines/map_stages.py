@@ -20,6 +20,7 @@ from odc.geo.geobox import GeoBox
 
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
 from brmgeo.errors import InputError, SettingsError, listed
+from brmgeo.files import json_of
 from brmgeo.geo.grid import Bounds, Window, as_bounds, blocks, bounds_of, gsd_of, lattice, shape_of
 from brmgeo.geo.sheets import check_extent, sheet_polygon
 from brmgeo.workflow.stage import Json, Map, Stage, unstated
@@ -144,7 +145,7 @@ def read_outlines(folder: Path) -> Footprints:
     from brmgeo.ingest.footprints import Footprints
     from brmgeo.ingest.repair import Repair
 
-    rest = json.loads((folder / "rest.json").read_text(encoding="utf-8"))
+    rest = json_of((folder / "rest.json").read_bytes())
     return Footprints(
         gpd.read_parquet(folder / "footprints.parquet"),
         gpd.read_parquet(folder / "sheets.parquet"),
@@ -232,7 +233,7 @@ def _known_ground(
 @functools.lru_cache(maxsize=4)
 def read_lattice(folder: Path) -> tuple[GeoBox, tuple[tuple[str, shapely.Geometry], ...]]:
     """The lattice that a ``lattice`` artifact holds, and its named known areas."""
-    text = json.loads((folder / "lattice.json").read_text(encoding="utf-8"))
+    text = json_of((folder / "lattice.json").read_bytes())
     known = tuple((name, shapely.from_wkt(wkt)) for name, wkt in text["known"])
     return lattice(as_bounds(text["bounds"]), text["crs"], text["gsd_m"]), known
 

@@ -92,7 +92,7 @@ def _write_facts(region: MapSettings, made: Mapping[str, Artifact], path: Path) 
             for label, artifact in made.items()
         },
     }
-    if files.read_json(path) != json.loads(json.dumps(facts)):
+    if files.read_json(path) != files.json_of(json.dumps(facts)):
         files.write_json(path, facts)
 
 

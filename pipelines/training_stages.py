@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from brmgeo.errors import InputError, SettingsError, listed
-from brmgeo.files import write_json
+from brmgeo.files import json_of, write_json
 from brmgeo.geo.grid import Bounds, Window, bounds_of, lattice, shape_of
 from brmgeo.segment import SPLITS
 from brmgeo.segment.samples import blank_unknown
@@ -299,7 +299,7 @@ def _mask(inputs: Inputs, own: GeoBox, align: bool = False) -> NDArray[np.uint8]
 @functools.lru_cache(maxsize=2)
 def surveyed(folder: Path) -> tuple[Json, ...]:
     """The tiles of a survey that are kept."""
-    text = json.loads((folder / "survey.json").read_text(encoding="utf-8"))
+    text = json_of((folder / "survey.json").read_bytes())
     return tuple(t for t in text["tiles"] if t["dropped"] is None)
 
 
@@ -409,7 +409,7 @@ def run_index(inputs: Inputs, out: Path, settings: IndexSettings, map: Map) -> J
     tallies = {split: Tally() for split in SPLITS}
     for name in settings.shards:
         folder = inputs[name]
-        text = json.loads((folder / "entries.json").read_text(encoding="utf-8"))
+        text = json_of((folder / "entries.json").read_bytes())
         for split, tally in text["tallies"].items():
             tallies[split].merge([Tally(**tally)])
         if not text["rows"]:
@@ -422,13 +422,13 @@ def run_index(inputs: Inputs, out: Path, settings: IndexSettings, map: Map) -> J
                 "tiles": len(text["rows"]),
             }
         )
-    facts = json.loads((inputs["survey"] / "survey.json").read_text(encoding="utf-8"))["facts"]
+    facts = json_of((inputs["survey"] / "survey.json").read_bytes())["facts"]
     if not rows:
         raise InputError(none_left(settings.region, facts["dropped"], {}))
     write_index(out / INDEX_CSV, rows)
     offsets = None
     if "alignment" in inputs:
-        offsets = json.loads((inputs["alignment"] / "alignment.json").read_text(encoding="utf-8"))
+        offsets = json_of((inputs["alignment"] / "alignment.json").read_bytes())
     if all(row["left"] is not None for row in rows):
         write_tiles_gpkg(out / "index.gpkg", rows, settings.credit, offsets["blocks"] if offsets else [])
     statistics = next(split for split in SPLITS if tallies[split].tiles)

@@ -275,3 +275,21 @@ def test_a_place_that_cannot_be_written_is_told_before_any_work(tmp_path: Path) 
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(WorkflowError, match="a file stands where a folder is wanted"):
             files.require_writable(place)
+
+
+@pytest.mark.parametrize("opening", ["[", '{"a":'])
+def test_json_that_is_nested_without_end_is_no_json(tmp_path: Path, opening: str) -> None:
+    for depth in (40, 100_000):
+        (tmp_path / "deep.json").write_text(opening * depth)
+        assert files.read_json(tmp_path / "deep.json") is None
+        with pytest.raises(ValueError, match=r"nested|Expecting"):
+            files.json_of(opening * depth)
+    whole = "[" * 40 + "]" * 40
+    with pytest.raises(ValueError, match="nested more than 32 deep"):
+        files.json_of(whole)
+
+
+def test_json_may_begin_with_a_byte_order_mark() -> None:
+    assert files.json_of("\ufeff[1, {}]".encode()) == [1, {}]
+    with pytest.raises(ValueError, match="digits"):
+        files.json_of("9" * 5000)

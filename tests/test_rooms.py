@@ -232,3 +232,14 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
 def test_a_circle_would_be_found() -> None:
     assert circles({"a": {"b"}, "b": {"c", "d"}, "c": {"a"}, "d": set()}) == [["a", "b", "c"]]
+
+
+def test_json_and_toml_have_one_reader_each() -> None:
+    """What people give may be nested without end, hold odd numbers or be no UTF-8: that is met in one place."""
+    readers = {"json.load", "json.loads", "tomllib.load", "tomllib.loads"}
+    found = set()
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and ast.unparse(node) in readers:
+                found.add((module, ast.unparse(node)))
+    assert found == {("brmgeo.files", "json.loads"), ("brmgeo.settings", "tomllib.loads")}

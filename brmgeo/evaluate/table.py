@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +13,7 @@ import numpy as np
 
 from brmgeo.errors import InputError
 from brmgeo.evaluate.scores import Scores
+from brmgeo.files import json_of
 
 EARLY_M = 450.0
 #: Figures that metrics.json of earlier versions lack: their results still compare.
@@ -84,7 +84,7 @@ class MethodSummary:
 def read_row(path: Path) -> FlightRow:
     """The row of one located flight, from its metrics.json; InputError for a file that is none."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json_of(path.read_bytes())
         within = values["within_sigma"]
         fields = {n: values[n] for n in Scores.__dataclass_fields__ if n not in _LATER}
         fields["share_smoothed"] = values.get("share_smoothed")

@@ -6,7 +6,6 @@ reference is read only when it is asked for, by name, so nothing that estimates 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 
 from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError
+from brmgeo.files import json_of
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
@@ -628,7 +628,7 @@ def is_own_odometry(folder: Path) -> bool:
 def own_method(folder: Path) -> str | None:
     """How odometry.json says that the flight's odometry was made from its frames; None where it was not."""
     try:
-        facts = json.loads((folder / "odometry.json").read_text(encoding="utf-8"))
+        facts = json_of((folder / "odometry.json").read_bytes())
     except (OSError, ValueError):
         return None
     if not isinstance(facts, dict) or facts.get("made_by") != MADE_BY:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, WorkflowError
-from brmgeo.files import told, whole_file
+from brmgeo.files import json_of, told, whole_file
 from brmgeo.match import MatchSettings
 
 _HEADER = "header"
@@ -47,7 +47,7 @@ def read_saved(path: Path, version: int) -> tuple[dict[str, Any], dict[str, NDAr
     try:
         with zipfile.ZipFile(path) as stored:
             parts = {info.filename.removesuffix(".npy"): _array(stored, info) for info in stored.infolist()}
-        header = json.loads(parts.pop(_HEADER).tobytes())
+        header = json_of(parts.pop(_HEADER).tobytes())
         found = header["format"]
     except (FileNotFoundError, NotADirectoryError):
         raise MissingInputError(f"{path}: there is no such saved state") from None

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError
+from brmgeo.files import json_of
 from brmgeo.match.ground import GroundMap
 from brmgeo.match.settings import MatchSettings
 
@@ -78,7 +79,7 @@ def _first_difference(given: NDArray[Any], own: NDArray[Any]) -> str:
     if own.ndim or own.dtype.kind != "U" or not str(own).startswith("{"):
         return f"{given.tolist()} there, {own.tolist()} here"
     try:
-        there, here = json.loads(str(given)), json.loads(str(own))
+        there, here = json_of(str(given)), json_of(str(own))
         for group, values in here.items():
             for name, value in values.items():
                 if there[group][name] != value:

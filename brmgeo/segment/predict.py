@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import InputError, MissingInputError, SettingsError, one_line
 from brmgeo.pictures import decode, read_bytes, rgb_of, scaled_levels
 from brmgeo.segment.weights import ModelCard
 
@@ -143,17 +143,25 @@ class _Network(Protocol):
 
 
 class _OnnxNetwork:
-    def __init__(self, session: Any) -> None:
+    def __init__(self, session: Any, path: Path) -> None:
         self._session = session
-        self._input = session.get_inputs()[0].name
+        self._path = path
+        inputs, outputs = session.get_inputs(), session.get_outputs()
+        ranks = [len(part.shape) for part in (*inputs, *outputs)]
+        if len(inputs) != 1 or len(outputs) < 1 or ranks[:2] != [4, 4] or inputs[0].type != "tensor(float)":
+            raise InputError(f"{path}: no network that takes (n, 3, h, w) float32 and gives (n, 1, h, w)")
+        self._input = inputs[0].name
 
     def __call__(self, x: F32) -> F32:
-        out: F32 = self._session.run(None, {self._input: x})[0][:, 0]
+        try:
+            out: F32 = self._session.run(None, {self._input: x})[0][:, 0]
+        except Exception as error:  # onnxruntime's errors have no common root but this
+            raise _failed(error, self._path) from error
         return out
 
 
 class _TorchNetwork:
-    def __init__(self, network: Any, temperature: float, threads: int) -> None:
+    def __init__(self, network: Any, temperature: float, threads: int, path: Path) -> None:
         import torch
 
         self._torch = torch
@@ -161,13 +169,25 @@ class _TorchNetwork:
         torch.set_num_threads(threads)
         self._network = network.to(memory_format=torch.channels_last)
         self._temperature = temperature
+        self._path = path
 
     def __call__(self, x: F32) -> F32:
         torch = self._torch
-        with torch.inference_mode():
-            seen = torch.from_numpy(x).contiguous(memory_format=torch.channels_last)
-            out: F32 = torch.sigmoid(self._network(seen) / self._temperature)[:, 0].numpy()
+        try:
+            with torch.inference_mode():
+                seen = torch.from_numpy(x).contiguous(memory_format=torch.channels_last)
+                out: F32 = torch.sigmoid(self._network(seen) / self._temperature)[:, 0].numpy()
+        except RuntimeError as error:
+            raise _failed(error, self._path) from error
         return out
+
+
+def _failed(error: Exception, path: Path) -> Exception:
+    """What a runtime's error on a picture is: MemoryError, or InputError for weights that do not run."""
+    said = one_line(error)
+    if "alloc" in said.lower() or isinstance(error, MemoryError):
+        return MemoryError(f"the network {path.name} asks for more than there is: {said}")
+    return InputError(f"{path}: the network does not run: {said}; get the weights again")
 
 
 def _load_onnx(path: Path, threads: int) -> tuple[_OnnxNetwork, ModelCard]:
@@ -184,9 +204,7 @@ def _load_onnx(path: Path, threads: int) -> tuple[_OnnxNetwork, ModelCard]:
     try:
         session = ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common root but this
-        raise InputError(
-            f"{path}: ONNX Runtime cannot open it: {' '.join(str(error).split())[:200]}"
-        ) from None
+        raise InputError(f"{path}: ONNX Runtime cannot open it: {one_line(error, 200)}") from None
     try:
         card = ModelCard.from_json(session.get_modelmeta().custom_metadata_map.get(CARD_KEY, ""))
     except InputError as error:
@@ -196,7 +214,7 @@ def _load_onnx(path: Path, threads: int) -> tuple[_OnnxNetwork, ModelCard]:
             f"{path}: a graph for tiles of {session.get_inputs()[0].shape[2]} px only, made for Deepness; give the .onnx "
             "without a fixed tile, or the .safetensors"
         )
-    return _OnnxNetwork(session), card
+    return _OnnxNetwork(session, path), card
 
 
 def cores() -> int:
@@ -268,7 +286,7 @@ class Segmenter:
 
             # An .onnx of it, made where torch is installed, runs without.
             network, card = load_network(tensors)
-            runs = _TorchNetwork(network, card.temperature, threads)
+            runs = _TorchNetwork(network, card.temperature, threads, path)
             return cls(card, "torch", tensors, runs, card.looks if looks is None else looks)
         if not graph.is_file():
             raise MissingInputError(

@@ -34,7 +34,7 @@ from brmgeo.codes import LABEL_BUILDING as BUILDING
 from brmgeo.codes import LABEL_OTHER as OTHER
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import InputError, MissingInputError
-from brmgeo.files import told
+from brmgeo.files import json_of, told
 from brmgeo.pictures import decode, encode
 from brmgeo.segment import SPLITS
 
@@ -275,7 +275,7 @@ def read_tiles(folder: Path | str) -> TileSet:
             f"{folder}: holds no training tiles ({TILES_JSON} is not there); name another folder, or cut them first"
         )
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = json_of(path.read_bytes())
     except (ValueError, OSError) as error:
         raise InputError(
             f"{path}: cannot be read ({' '.join(str(error).split())[:120]}); cut the tiles again"

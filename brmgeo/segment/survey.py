@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brmgeo.files import json_of
 from brmgeo.geo.grid import Bounds
 from brmgeo.segment.tiles import sample_empty
 
@@ -55,7 +55,7 @@ def label_offset(folder: Path, bounds: Bounds) -> tuple[float, float]:
 @functools.lru_cache(maxsize=2)
 def _offsets(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """(n, 4) x, y, dx, dy of the blocks that tell; the region's (dx, dy), zero where it cannot tell; side of a block."""
-    text = json.loads((folder / "alignment.json").read_text(encoding="utf-8"))
+    text = json_of((folder / "alignment.json").read_bytes())
     told = [
         ((b["bounds"][0] + b["bounds"][2]) / 2, (b["bounds"][1] + b["bounds"][3]) / 2, b["dx_m"], b["dy_m"])
         for b in text["blocks"]

@@ -36,7 +36,7 @@ from torch.nn import functional
 from brmgeo.codes import LABEL_BUILDING as BUILDING
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
 from brmgeo.errors import InputError, SettingsError
-from brmgeo.files import digest_of, whole_file
+from brmgeo.files import digest_of, json_of, whole_file
 from brmgeo.segment.augment import MEAN, STD, AugmentSettings, Source, draw_crop
 from brmgeo.segment.imagenet import imagenet_weights, start_from_imagenet
 from brmgeo.segment.unet import UNet, UNetSettings
@@ -466,7 +466,7 @@ class Trainer:
         path = self._path
         try:
             with safetensors.safe_open(path, "pt") as file:
-                facts = json.loads((file.metadata() or {})["brmgeo"])
+                facts = json_of((file.metadata() or {})["brmgeo"])
             tensors = load_file(path)
         except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
             raise InputError(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.extras import extra
-from brmgeo.files import write_bytes, write_text
+from brmgeo.files import json_of, write_bytes, write_text
 
 if TYPE_CHECKING:
     from brmgeo.segment.unet import UNet
@@ -115,7 +115,7 @@ class ModelCard:
     def from_json(cls, text: str) -> ModelCard:
         """The card of such a text; InputError where it is not one."""
         try:
-            values = json.loads(text)
+            values = json_of(text)
         except ValueError as error:
             raise InputError(f"model card: not JSON ({error})") from None
         known = {f.name for f in fields(cls)}

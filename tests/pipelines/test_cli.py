@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import errno
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +17,7 @@ import pytest
 from brmgeo.errors import InputError
 from brmgeo.match import METHODS
 from pipelines.cli import METHODS as OFFERED
-from pipelines.cli import _Command, cli, run
+from pipelines.cli import _Command, cli, last_door, run
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -48,6 +51,48 @@ def test_a_need_that_this_command_has_no_option_for_is_left_out(capsys: pytest.C
 def test_a_full_disk_is_a_line_with_the_place(capsys: pytest.CaptureFixture[str]) -> None:
     told = _told(capsys, _fail(OSError(errno.ENOSPC, "No space left on device", "/mnt/a.tif")))
     assert told.startswith("brmgeo: /mnt/a.tif cannot be read or written: the disk is full")
+
+
+def test_too_little_memory_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    told = _told(capsys, _fail(MemoryError("Unable to allocate 2.00 TiB for an array")))
+    assert told.startswith("brmgeo: the memory of this machine is not enough (Unable to allocate 2.00 TiB")
+
+
+def test_a_defect_is_a_line_that_says_how_to_report_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert last_door(_fail(ZeroDivisionError("division\nby zero")), ["maps", "demo"]) == 70
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "ZeroDivisionError: division by zero" in told
+    assert "test_cli.py" in told
+    assert "--traceback" in told
+
+
+def test_the_traceback_of_a_defect_is_shown_on_demand(capsys: pytest.CaptureFixture[str]) -> None:
+    assert last_door(_fail(ZeroDivisionError("division by zero")), ["maps", "--traceback"]) == 70
+    told = capsys.readouterr().err
+    assert told.startswith("Traceback (most recent call last)")
+    assert told.endswith("to its maintainers\n")
+
+
+@pytest.mark.parametrize("words", [["--traceback", "maps"], ["maps", "--traceback"]])
+def test_the_traceback_can_be_asked_for_before_and_after_the_command(words: list[str]) -> None:
+    assert run(lambda: cli(words, standalone_mode=False)) == 2
+
+
+def test_a_defect_passes_where_tests_would_see_it() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run(_fail(ZeroDivisionError()))
+
+
+def test_a_name_that_the_terminal_cannot_write_is_escaped(tmp_path: Path) -> None:
+    odd = os.fsencode(tmp_path) + b"/\xeb\xb0\xff.toml"
+    got = subprocess.run(
+        [sys.executable, "-m", "brmgeo", "maps", os.fsdecode(odd)], capture_output=True, cwd=ROOT,
+        env={**os.environ, "LC_ALL": "C", "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "0"},
+    )  # fmt: skip
+    assert got.returncode == 2
+    assert got.stderr.startswith(b"brmgeo: ")
+    assert got.stderr.count(b"\n") == 1
 
 
 def test_the_methods_offered_are_those_that_there_are() -> None:

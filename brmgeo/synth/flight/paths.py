@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import shapely
 from scipy.ndimage import uniform_filter
 
 from brmgeo.errors import InputError
-from brmgeo.files import told
+from brmgeo.files import json_of, told
 from brmgeo.flight.readings import FloatArray
 from brmgeo.geo.crs import LONLAT, transformer
 from brmgeo.synth.flight.ground import RaisedFootprints
@@ -81,7 +80,7 @@ def path_from_geojson(file: Path | str, crs: str) -> FloatArray:
     """
     file = Path(file)
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        data = json_of(file.read_bytes())
         features = data["features"] if data["type"] == "FeatureCollection" else [data]
         shapes = [f["geometry"] if f["type"] == "Feature" else f for f in features]
         lines = [g["coordinates"] for g in shapes if g["type"] == "LineString"]
