@@ -1143,6 +1143,15 @@ def run(command: Callable[[], Any]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except UnicodeEncodeError as error:
+        # Python takes file names of any bytes, the libraries that read and write files take UTF-8.
+        if error.reason != "surrogates not allowed":
+            raise
+        click.echo(
+            f"brmgeo: {error.object!a} is no UTF-8, as the names of files must be: rename the file or folder",
+            err=True,
+        )
+        return 2
     except MemoryError as error:
         click.echo(
             f"brmgeo: the memory of this machine is not enough ({one_line(error)}): give a smaller area or picture, "

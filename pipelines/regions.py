@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator
 from contextlib import suppress
@@ -96,8 +97,8 @@ def flown_mark(name: str, data: Path) -> Path:
 
 def note_flown(name: str, data: Path, out: Path) -> None:
     """Keeps in mind that results over a region went to ``out``: such a region is not trained on."""
-    usual = ((data / "out" / name / part).resolve() for part in ("flights", "evaluation"))
-    if not any(out.resolve().is_relative_to(place) for place in usual):
+    usual = (os.path.realpath(data / "out" / name / part) for part in ("flights", "evaluation"))
+    if not any(Path(os.path.realpath(out)).is_relative_to(place) for place in usual):
         mark = flown_mark(name, data)
         mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()

@@ -5,6 +5,7 @@ Folders that are not part of the project are given with ``--source NAME=PATH``.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -141,7 +142,7 @@ def _require_usable(spec: SourceSpec, paths: Mapping[str, Path], data: Path) -> 
     """Raises SettingsError for a folder of tiles that are for testing, or that another source names too."""
     folder = paths[spec.name]
     for name, other in paths.items():
-        if name != spec.name and other.resolve() == folder.resolve():
+        if name != spec.name and os.path.realpath(other) == os.path.realpath(folder):
             raise SettingsError(
                 f"--source {spec.name} and {name} are one folder, {folder}: give it to one of them"
             )

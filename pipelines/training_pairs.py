@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -159,7 +160,7 @@ def cut_pairs(
     if not 0.02 <= gsd_m <= 10:
         raise SettingsError(f"tiles --pairs: --gsd {gsd_m:g} is no size of a pixel in metres (0.02 to 10)")
     for folder in (images, masks) if split != "test" else ():
-        at = folder.resolve()
+        at = Path(os.path.realpath(folder))
         if any((p / "flight.toml").is_file() for p in (at, *at.parents[:2])):
             raise SettingsError(
                 f"tiles --pairs: {folder} is of a flight (flight.toml stands by it), which is for testing only: give "

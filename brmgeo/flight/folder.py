@@ -7,6 +7,7 @@ reference is read only when it is asked for, by name, so nothing that estimates 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -270,7 +271,7 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
     reference = _reference(toml, folder)
     return Flight(
         folder,
-        toml.text("", "name") if toml.has("", "name") else folder.resolve().name,
+        toml.text("", "name") if toml.has("", "name") else os.path.basename(os.path.realpath(folder)),
         camera,
         mount,
         frames,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,8 @@ class Video:
     def _opened(self) -> Any:
         if not self.path.is_file():
             raise FlightError(f"{self.path}: the video is missing")
-        self._capture = cv2.VideoCapture(str(self.path))
+        # OpenCV dies of a name that is no UTF-8; this raises.
+        self._capture = cv2.VideoCapture(os.fspath(self.path).encode("utf-8").decode())
         if not self._capture.isOpened() or self._capture.get(cv2.CAP_PROP_FPS) <= 0:
             self.close()
             raise FlightError(

@@ -82,7 +82,9 @@ def _messages(path: Path) -> Messages:
         if path.suffix.lower() == ".log":
             log = reader.DFReader_text(str(path), zero_time_base=True)
         else:
-            if path.stat().st_size and path.read_bytes()[:2] != b"\xa3\x95":
+            with path.open("rb") as file:
+                begins = file.read(2)
+            if begins != b"\xa3\x95":
                 raise FlightError(
                     f"{path}: no ArduPilot dataflash log: it does not begin with a message header"
                 )
