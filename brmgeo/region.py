@@ -52,6 +52,17 @@ class FootprintsSettings(_Settings):
         return value
 
 
+_TILED = {"level", "pixel_ratio", "missing_share", "grid"}
+# Keys of [imagery] by kind: one that would be ignored is refused.
+_GOES_WITH = {
+    "tiles": _TILED | {"path", "template"},
+    "mbtiles": _TILED | {"path"},
+    "service": _TILED | {"url", "key_env", "connections", "rate_per_s", "retries", "timeout_s"},
+    "raster": {"path", "crs", "bands", "value_range"},
+}
+_GOES_WITH_ALL = {"kind", "attribution", "terms", "compression"}
+
+
 class ImagerySettings(_Settings):
     """Where imagery comes from.
 
@@ -82,6 +93,15 @@ class ImagerySettings(_Settings):
 
     @model_validator(mode="after")
     def _complete(self) -> ImagerySettings:
+        foreign = sorted(self.model_fields_set - _GOES_WITH[self.kind] - _GOES_WITH_ALL)
+        if self.kind == "mbtiles" and self.grid == "kakao" and "grid" in self.model_fields_set:
+            raise ValueError(
+                "an MBTiles file is in grid 'webmercator', not 'kakao': correct 'grid', or leave it out"
+            )
+        if foreign:
+            raise ValueError(
+                f"{foreign[0]!r} does not go with kind {self.kind!r}: leave it out, or correct the kind"
+            )
         if self.kind in ("tiles", "service") and self.level is None:
             raise ValueError(f"kind {self.kind!r} needs 'level', the zoom level of the tiles")
         if self.kind == "service":

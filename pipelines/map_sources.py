@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import MissingInputError, SettingsError, listed
+from brmgeo.errors import InputError, MissingInputError, SettingsError, listed
 from brmgeo.files import digest_of
+from brmgeo.geo.formats import raster_driver
 from brmgeo.geo.grid import Bounds, as_bounds, bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import grid_named
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from brmgeo.ingest.imagery import ImagerySource
     from brmgeo.ingest.tiles import MBTiles, TileFolder
 
-RASTER_SUFFIXES = (".tif", ".tiff", ".vrt", ".jpg", ".jpeg", ".png", ".jp2", ".img")
+RASTER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg", ".png", ".jp2", ".img")
 VECTOR_SUFFIXES = (".dxf", ".shp", ".gpkg", ".geojson", ".json", ".parquet", ".fgb")
 
 
@@ -201,9 +202,9 @@ def _is_placed(path: Path) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            with rasterio.open(path) as src:
+            with rasterio.open(path, driver=raster_driver(path)) as src:
                 return not src.transform.is_identity or bool(src.gcps[0])
-        except RasterioError:
+        except (InputError, RasterioError):
             return True  # the adapter says what is wrong with it
 
 

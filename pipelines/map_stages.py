@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -127,7 +128,8 @@ def run_outlines(inputs: Inputs, out: Path, settings: OutlinesSettings, map: Map
     for repair in repairs:
         kept = examples.setdefault(repair["kind"], [])
         if len(kept) < 3:
-            kept.append(repair)
+            # What has no vertex lies nowhere.
+            kept.append(repair | {k: None for k in ("x", "y") if not math.isfinite(repair[k])})
     return {
         "file": name,
         "area_m2": round(float(read.frame.area.sum()), 2),

@@ -10,6 +10,7 @@ import pyogrio
 from brmgeo.errors import MissingInputError, SettingsError
 from brmgeo.files import whole_file
 from brmgeo.geo.crs import LONLAT, parse_crs
+from brmgeo.geo.formats import vector_file
 
 WHAT = ("online", "smoothed", "reference", "candidates")
 DRIVERS = {".gpkg": "GPKG", ".geojson": "GeoJSON", ".csv": "CSV"}
@@ -41,7 +42,7 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
     source, layer = _source(results, what)
     if out.exists() and out.samefile(source):
         raise SettingsError(f"export --out {out}: that is the file it is read from; choose another name")
-    frame = pyogrio.read_dataframe(source, layer=layer)
+    frame = pyogrio.read_dataframe(vector_file(source), layer=layer)
     if what == "candidates" and source.suffix == ".geojson" and target is None:
         epsg = frame["epsg"].dropna()
         target = parse_crs(f"EPSG:{int(epsg.iloc[0])}") if len(epsg) else parse_crs(LONLAT)
@@ -76,7 +77,7 @@ def _source(results: Path, what: str) -> tuple[Path, str | None]:
     path = results / "trajectory.gpkg"
     if not path.is_file():
         raise MissingInputError(f"{path} is not there; run localize again")
-    layers = [str(name) for name, _ in pyogrio.list_layers(path)]
+    layers = [str(name) for name, _ in pyogrio.list_layers(vector_file(path))]
     if what not in layers:
         there = ", ".join(itertools.filterfalse(lambda n: n not in WHAT, layers))
         raise MissingInputError(f"{path}: these results have no {what} path; there are {there}")

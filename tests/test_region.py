@@ -108,3 +108,21 @@ def test_a_region_has_a_place_where_maps_alone_may_leave_it_to_the_footprints() 
     for kind in (MapSettings, Region):
         with pytest.raises(SettingsError, match="left < right and bottom < top"):
             checked(kind, asked | {"bounds": (9.0, 9.0, 1.0, 1.0)}, "maps")
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "said"),
+    [
+        ("mbtiles", 'grid = "kakao"', "an MBTiles file is in grid 'webmercator'"),
+        ("mbtiles", 'template = "{z}/{x}"', "'template' does not go with kind 'mbtiles'"),
+        ("raster", "pixel_ratio = 2", "'level' does not go with kind 'raster'"),
+        ("tiles", 'key_env = "K"', "'key_env' does not go with kind 'tiles'"),
+        ("tiles", 'crs = "EPSG:5187"', "'crs' does not go with kind 'tiles'"),
+    ],
+)
+def test_a_key_of_imagery_that_would_be_ignored_is_refused(
+    tmp_path: Path, kind: str, key: str, said: str
+) -> None:
+    text = GOOD.replace('kind = "tiles"', f'kind = "{kind}"\n{key}')
+    with pytest.raises(SettingsError, match=said):
+        load_region(write(tmp_path, text))

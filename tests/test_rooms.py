@@ -17,6 +17,7 @@ FOUNDATION = {
     "brmgeo.settings",
     "brmgeo.pictures",
     "brmgeo.extras",
+    "brmgeo.memory",
 }
 VALUES = FOUNDATION | {
     "brmgeo.region",
@@ -67,9 +68,10 @@ MAY_KNOW = {
     "brmgeo.settings": {"brmgeo.errors", "brmgeo.files"},
     "brmgeo.pictures": {"brmgeo.errors", "brmgeo.files"},
     "brmgeo.extras": {"brmgeo.errors"},
+    "brmgeo.memory": {"brmgeo.errors"},
     "brmgeo.region": FOUNDATION,
     "brmgeo.geo": FOUNDATION,
-    "brmgeo.geo.raster": {"brmgeo.codes", "brmgeo.errors", "brmgeo.geo.grid"},
+    "brmgeo.geo.raster": {"brmgeo.codes", "brmgeo.errors", "brmgeo.geo.grid", "brmgeo.geo.formats"},
     "brmgeo.flight.values": set[str](),
     "brmgeo.maps": VALUES,
     "brmgeo.match": VALUES | {"brmgeo.maps.ratio", "brmgeo.flight.view"},
@@ -243,3 +245,34 @@ def test_json_and_toml_have_one_reader_each() -> None:
             if isinstance(node, ast.Attribute) and ast.unparse(node) in readers:
                 found.add((module, ast.unparse(node)))
     assert found == {("brmgeo.files", "json.loads"), ("brmgeo.settings", "tomllib.loads")}
+
+
+def test_gdal_opens_what_was_looked_at_first() -> None:
+    """A raster names its driver, and shapes go through vector_file: GDAL follows whatever some formats point to."""
+    readers = {
+        "pyogrio.read_dataframe",
+        "pyogrio.read_info",
+        "pyogrio.list_layers",
+        "gpd.read_file",
+        "gpd.read_parquet",
+    }
+    # The store's own artifacts.
+    own = {"pipelines.map_stages"}
+    loose = []
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                continue
+            called = ast.unparse(node.func)
+            if called == "rasterio.open":
+                written = len(node.args) > 1 and ast.unparse(node.args[1]) == "'w'"
+                good = written or any(k.arg == "driver" for k in node.keywords)
+            else:
+                good = (
+                    called not in readers
+                    or module in own
+                    or ast.unparse(node.args[0]).startswith("vector_file(")
+                )
+            if not good:
+                loose.append(f"{module}:{node.lineno} {called}")
+    assert loose == []

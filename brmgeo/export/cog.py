@@ -419,7 +419,7 @@ def _check_complete(part: Path, path: Path) -> None:
     """
     size = part.stat().st_size
     try:
-        with rasterio.open(part) as src:
+        with rasterio.open(part, driver="GTiff") as src:
             last_x, last_y = (src.width - 1) // BLOCK_PX, (src.height - 1) // BLOCK_PX
             start = src.get_tag_item(f"BLOCK_OFFSET_{last_x}_{last_y}", "TIFF", bidx=1)
             length = src.get_tag_item(f"BLOCK_SIZE_{last_x}_{last_y}", "TIFF", bidx=1)

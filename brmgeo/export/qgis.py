@@ -26,6 +26,7 @@ from brmgeo.export import qgis_style as style
 from brmgeo.export.qgis_style import Style, sub
 from brmgeo.extras import extra
 from brmgeo.files import whole_file
+from brmgeo.geo.formats import vector_file
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.raster import opened
 
@@ -235,7 +236,9 @@ def _path_layers(
 def _candidate_layers(candidates: Path, crs: CRS, attribution: str) -> list[_Layer]:
     """The candidates' layer; none where there is no candidate."""
     lonlat = candidates.suffix == ".geojson"
-    facts = pyogrio.read_info(candidates, layer=None if lonlat else candidates.stem, force_feature_count=True)
+    facts = pyogrio.read_info(
+        vector_file(candidates), layer=None if lonlat else candidates.stem, force_feature_count=True
+    )
     # A GeoJSON file without features has no geometry type, and QGIS drops such a layer.
     if not facts["features"]:
         return []
@@ -307,9 +310,9 @@ def _raster_facts(path: Path) -> tuple[CRS, Bounds, list[float | None]]:
 def _vector_facts(path: Path, layer: str) -> tuple[str | None, list[str], CRS | None]:
     """Point, Line or Polygon, the field names and the CRS of a layer; None when the file has no such layer."""
     try:
-        if layer not in pyogrio.list_layers(path)[:, 0]:
+        if layer not in pyogrio.list_layers(vector_file(path))[:, 0]:
             return None, [], None
-        info = pyogrio.read_info(path, layer=layer)
+        info = pyogrio.read_info(vector_file(path), layer=layer)
     except pyogrio.errors.DataSourceError as error:
         raise InputError(f"{path}: cannot be read as a vector file ({error}); write it again") from error
     kind = str(info["geometry_type"])
@@ -325,7 +328,7 @@ def _distinct(path: Path, layer: str, field: str | None) -> list[str]:
     if field is None:
         return []
     found = pyogrio.read_dataframe(
-        path, sql=f'SELECT DISTINCT "{field}" AS v FROM "{layer}"', read_geometry=False
+        vector_file(path), sql=f'SELECT DISTINCT "{field}" AS v FROM "{layer}"', read_geometry=False
     )
     return sorted(str(v) for v in found["v"] if v is not None)
 
@@ -341,7 +344,8 @@ def _same_crs(found: CRS | None, wanted: CRS, path: Path) -> None:
 def _path_bounds(trajectory: Path, layers: Sequence[str]) -> Bounds | None:
     """Bounds of a flight's layers, widened by a fifth and at least 100 m; None when they hold no point."""
     boxes = [
-        pyogrio.read_info(trajectory, layer=name, force_total_bounds=True)["total_bounds"] for name in layers
+        pyogrio.read_info(vector_file(trajectory), layer=name, force_total_bounds=True)["total_bounds"]
+        for name in layers
     ]
     boxes = [b for b in boxes if b is not None and np.isfinite(b).all() and tuple(b) != (0, 0, 0, 0)]
     if not boxes:

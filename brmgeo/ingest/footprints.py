@@ -28,6 +28,7 @@ from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KIND_OF_NAME
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.extras import extra
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
+from brmgeo.geo.formats import vector_file
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
 from brmgeo.ingest.dxf import MAX_DROPPED_SHARE, SNAP_M, read_dxf
@@ -40,6 +41,7 @@ from brmgeo.ingest.repair import (
     repair_rings,
     shape_keys,
 )
+from brmgeo.memory import require_memory
 
 with extra("maps", "reading footprints"):
     import geopandas as gpd
@@ -52,6 +54,10 @@ SHEET_COLUMNS = ("geometry", "sheet", "source", "outline", "footprints", "area_m
 EDGE_TOLERANCE_M = 0.05
 # Neatlines agree with the sheet number to less than a millimetre; a wrong datum moves them by some 300 m.
 NEATLINE_TOLERANCE_M = 5.0
+
+# What reading takes, measured: a row with its attributes and repairs, and its geometry as WKB and as an object.
+_BYTES_A_ROW = 1400
+_TIMES_UNPACKED = 4
 
 _KIND_COLUMNS = ("kind", "종류")
 _FLOOR_COLUMNS = ("floors", "층수", "building:levels")
@@ -342,7 +348,7 @@ def _from_vector(
     )
     repairs = list(repaired.repairs)
     for i in open_rows:
-        xy = shapely.get_coordinates(geometry[i])
+        xy = shapely.get_coordinates([geometry[i]])  # a list, for of None alone there is no array
         kind, detail = (
             ("open", "a line whose ends do not meet; dropped")
             if len(xy)
@@ -396,14 +402,17 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
             # GDAL warns of what is no harm here (missing .dbf, ring order); damage is checked below.
             warnings.simplefilter("ignore")
             if suffix in {".parquet", ".geoparquet"}:
-                return gpd.read_parquet(path)
+                _require_room(path)
+                return gpd.read_parquet(vector_file(path))
             if suffix == ".shp":
                 _check_shapefile(path)
                 if encoding is None and not path.with_suffix(".cpg").exists():
                     encoding = "EUC-KR"
             with _with_index(path) as whole:
                 layer = layer or _only_layer(whole)
-                frame = pyogrio.read_dataframe(whole, layer=layer, encoding=encoding, on_invalid="ignore")
+                frame = pyogrio.read_dataframe(
+                    vector_file(whole), layer=layer, encoding=encoding, on_invalid="ignore"
+                )
     except InputError:
         raise
     except Exception as error:  # GDAL, pyarrow and geopandas raise many kinds on damaged files
@@ -418,6 +427,18 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
     if not isinstance(frame, gpd.GeoDataFrame):
         raise InputError(f"{path.name}: holds no geometry, only a table: give a file with building polygons")
     return frame
+
+
+def _require_room(path: Path) -> None:
+    """InputError where a GeoParquet file does not fit into memory: packed, a few bytes may stand for any number."""
+    import pyarrow.parquet
+
+    file = pyarrow.parquet.ParquetFile(path)
+    needed = _BYTES_A_ROW * file.metadata.num_rows
+    instead = "cut the area that you need out of the file first, such as with ogr2ogr -spat"
+    for batch in file.iter_batches():
+        require_memory(needed, f"{path.name} of {file.metadata.num_rows} rows", instead)
+        needed += _TIMES_UNPACKED * batch.nbytes
 
 
 @contextmanager
@@ -438,10 +459,11 @@ def _with_index(path: Path) -> Iterator[Path]:
 
 
 def _only_layer(path: Path) -> str:
-    names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
-    areas = [
-        str(name) for name, kind in pyogrio.list_layers(path) if kind is not None and "Polygon" in str(kind)
+    layers = [
+        (str(name), str(kind)) for name, kind in pyogrio.list_layers(vector_file(path)) if kind is not None
     ]
+    names = [name for name, _ in layers]
+    areas = [name for name, kind in layers if "Polygon" in kind]
     if len(areas) == 1 or len(names) == 1:
         return (areas if len(areas) == 1 else names)[0]
     for usual in ("footprints", "buildings"):

@@ -37,6 +37,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.geo.crs import belt_for_sheet, crs_name, parse_crs, same_crs, transform_bounds, transformer
+from brmgeo.geo.formats import raster_driver
 from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import Tile
@@ -52,7 +53,7 @@ _SQUARE_TOLERANCE = 0.005
 
 @dataclass(frozen=True, slots=True)
 class GeoRaster:
-    """A GeoTIFF, VRT, or JPEG/PNG/TIFF with a world file: anything GDAL reads with 1 (grey), 3 or more bands.
+    """A GeoTIFF, or JPEG/PNG/TIFF with a world file (formats: ``geo.formats``), with 1 (grey), 3 or more bands.
 
     Attributes:
         path: the file.
@@ -260,7 +261,7 @@ def _plane_of(source: ImagerySource) -> Iterator[_Plane]:
         # Said better below, with what to do.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            src = rasterio.open(path)
+            src = rasterio.open(path, driver=raster_driver(path))
         except (RasterioError, CPLE_BaseError) as error:
             raise InputError(
                 f"{path} is not a readable image ({one_line(error)}); fetch or export it again"

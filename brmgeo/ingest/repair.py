@@ -37,7 +37,7 @@ class Repair:
             or, with the outline dropped, "zero_area", "open" (its ends do not meet) and "unreadable".
         handle: the entity's handle or feature number, "" when it has none.
         layer: its layer.
-        x, y: where, in the source's coordinates, metres.
+        x, y: where, in the source's coordinates, metres; not finite where the outline has no vertex.
         detail: what was found, for people.
         source: the file's name.
     """

@@ -26,8 +26,8 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import Protocol
-from urllib.parse import quote
+from typing import Any, Protocol
+from urllib.parse import quote, urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,14 @@ _MAX_TILE_BYTES = 16 << 20
 _RETRY_STATUS = {408, 425, 429, 500, 502, 503, 504}
 _ABSENT_STATUS = {204, 404, 410}
 _LONGEST_WAIT_S = 120.0
-# A key typed into a URL would go into provenance: names of query parameters that carry one.
-_KEY_PARAMETER = re.compile(r"[?&](?:[\w-]*(?:key|token|secret|signature))=(?!\{key\})[^&{}]+", re.IGNORECASE)
+# A key typed into a URL would go into provenance: a user's name and password, query parameters whose names say that they
+# carry one, and what no person writes: twenty letters and digits in a row.
+_KEYS_IN_URLS = re.compile(
+    r"://[^/?#]*@"
+    r"|[?&;](?:[\w.-]*(?:key|token|secret|signature|auth|pass|credential|session)\w*|sig|sign|pwd?|jwt)=(?!\{key\})[^&;{}]+"
+    r"|(?<![A-Za-z0-9])(?=[A-Za-z]*[0-9])(?=[0-9]*[A-Za-z])(?=(?:[A-Za-z]*[0-9]){3})[A-Za-z0-9]{20,}",
+    re.IGNORECASE,
+)
 
 
 class TileSource(Protocol):
@@ -167,15 +173,16 @@ class MBTiles:
             raise MissingInputError(f"there is no MBTiles file {path}")
         with _sqlite(path) as db:
             meta = {str(k): str(v) for k, v in db.execute("SELECT name, value FROM metadata")}
-            levels = [
-                int(z) for (z,) in db.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level")
-            ]
+            levels = [z for (z,) in db.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level")]
         if meta.get("format", "png").lower() == "pbf":
             raise InputError(
                 f"{path} holds vector tiles (pbf): give an MBTiles file of images (png, jpg or webp)"
             )
         if not levels:
             raise InputError(f"{path} holds no tile at all: make it again")
+        odd = [z for z in levels if not (isinstance(z, int) and 0 <= z <= 30)]
+        if odd:
+            raise InputError(f"{path}: {odd[0]!r} is no zoom level: the file is damaged, make it again")
         if level is not None and level not in levels:
             raise InputError(
                 f"{path} has no tiles at level {level}: give one of {', '.join(map(str, levels))}"
@@ -188,7 +195,7 @@ class MBTiles:
     def where(self) -> str:
         return f"{self.path} (level {self.level})"
 
-    def _row(self, tile: Tile, column: str) -> bytes | None:
+    def _row(self, tile: Tile, column: str) -> Any:
         y = tile.y if self.xyz_rows else self.grid.flipped(tile, self.level).y
         with _sqlite(self.path) as db:
             query = f"SELECT {column} FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
@@ -203,7 +210,9 @@ class MBTiles:
         if data is None:
             return None
         try:
-            return decode_tile(bytes(data), self.grid.tile_px * self.pixel_ratio)[0]
+            if not isinstance(data, bytes):
+                raise ValueError(f"it is {type(data).__name__} {data!r:.40}, no image")
+            return decode_tile(data, self.grid.tile_px * self.pixel_ratio)[0]
         except ValueError as error:
             raise InputError(
                 f"tile {self.level}/{tile.x}/{tile.y} in {self.path}: {error}; make the file again"
@@ -252,10 +261,11 @@ class TileService:
             raise SettingsError(
                 f"tile service {self.url_template!r}: give a URL that begins with http:// or https://"
             )
-        if _KEY_PARAMETER.search(self.url_template):
+        if _KEYS_IN_URLS.search(self.url_template):
             raise SettingsError(
-                "the tile service's URL holds a key in plain text: write {key} in its place and name the environment "
-                "variable that holds it in key_env, so that it stays out of results and messages"
+                f"the URL of the tile service at {urlsplit(self.url_template).hostname} holds what looks like a key: "
+                "write {key} in its place and name the environment variable that holds it in key_env, so that it stays "
+                "out of results and messages"
             )
         wants_key = any(
             "{key}" in text for text in (self.url_template, *(value for _, value in self.headers))

@@ -23,7 +23,9 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
 from brmgeo.errors import InputError, one_line
 from brmgeo.geo.crs import LONLAT, transformer
+from brmgeo.geo.formats import raster_driver
 from brmgeo.geo.grid import Window
+from brmgeo.memory import require_memory
 from brmgeo.pictures import colour_bands, palette_of, scaled_levels
 from brmgeo.segment.predict import (
     MIN_PX,
@@ -38,6 +40,9 @@ from brmgeo.segment.predict import (
 )
 
 _BLOCK_PX = 512
+# About a day of work on two cores.
+_MOST_PX = 40_000_000_000
+_BYTES_A_COLUMN = 6000
 
 
 class RasterReader:
@@ -96,6 +101,14 @@ class RasterReader:
             raise InputError(
                 f"{path}: {cols} x {rows} px are too few: give a raster of at least {MIN_PX} px a side"
             )
+        if rows * cols > _MOST_PX:
+            raise InputError(
+                f"{path}: {cols} x {rows} px at {self.native_m:.3g} m, days of work: cut out what you need first, at most "
+                f"{_MOST_PX:.0e} px"
+            )
+        require_memory(
+            _BYTES_A_COLUMN * cols, f"{path.name} of {cols} x {rows} px", "cut it into narrower strips"
+        )
         self._scale = (src.height / rows, src.width / cols)
         self.gsd_m = self.native_m * math.sqrt(self._scale[0] * self._scale[1])
         affine = src.transform @ Affine.scale(self._scale[1], self._scale[0])
@@ -213,7 +226,7 @@ def open_raster(
         with warnings.catch_warnings():
             # That a raster has no place is told as an error of its own.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            src = rasterio.open(path)
+            src = rasterio.open(path, driver=raster_driver(path))
         with src:
             yield RasterReader(src, path, segmenter, levels, bands)
     except RasterioError as error:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import MissingInputError
 from brmgeo.flight.readings import Camera, FloatArray
+from brmgeo.geo.formats import vector_file
 from brmgeo.geo.grid import Bounds
 from brmgeo.geo.raster import read_raster
 from brmgeo.region import FlightSettings
@@ -48,7 +49,9 @@ def read_ground(footprints: Path) -> RaisedFootprints:
     """Footprints made ready for the simulator, with heights from their floors (3 m each) where they are known."""
     import geopandas as gpd
 
-    frame = gpd.read_file(footprints, layer="footprints" if footprints.suffix == ".gpkg" else None)
+    frame = gpd.read_file(
+        vector_file(footprints), layer="footprints" if footprints.suffix == ".gpkg" else None
+    )
     floors = frame["floors"].fillna(1).to_numpy(dtype=float) if "floors" in frame else np.ones(len(frame))
     return RaisedFootprints.from_polygons(list(frame.geometry), list(_FLOOR_M * floors))
 

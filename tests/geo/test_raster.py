@@ -96,7 +96,7 @@ def test_reading_refuses(tmp_path: Path, ratio: NDArray[np.uint16]) -> None:
     with pytest.raises(MissingInputError, match=r"no\.tif"):
         read_window(tmp_path / "no.tif")
     (tmp_path / "junk.tif").write_bytes(b"junk")
-    with pytest.raises(InputError, match="not a readable raster"):
+    with pytest.raises(InputError, match="not a readable image or raster"):
         box_of(tmp_path / "junk.tif")
     path = tmp_path / "r.tif"
     write_cog(path, ratio, BOX, kind="ratio", radii_m=RADII)

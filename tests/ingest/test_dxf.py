@@ -465,3 +465,13 @@ def test_a_real_sheet_agrees_with_ezdxf_vertex_by_vertex(name):
 def test_a_real_sheet_without_buildings():
     read = read_dxf(real("35812062_contours_only.dxf"))
     assert (len(read.footprints), read.counts["outlines"]) == (0, 0)
+
+
+def test_a_drawing_larger_than_memory_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (tmp_path / "big.dxf").open("wb") as file:
+        file.truncate(10_000_000)
+    monkeypatch.setattr("brmgeo.memory.free_bytes", lambda: 50_000_000)
+    with pytest.raises(InputError, match=r"big\.dxf of 10 MB takes about 0\.3 GB of memory"):
+        read_dxf(tmp_path / "big.dxf")

@@ -306,10 +306,25 @@ def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_service_settings_are_checked(tmp_path: Path) -> None:
     """Keys in plain text, missing key_env, odd URLs and numbers are refused before anything is asked."""
-    for url in ("https://a/{z}/{x}/{y}?apikey=abc123", "https://a/{z}/{x}/{y}?access_token=abc&x=1"):
-        with pytest.raises(SettingsError, match="plain text") as caught:
+    for url in (
+        "https://a/{z}/{x}/{y}?apikey=abc123",
+        "https://a/{z}/{x}/{y}?access_token=abc&x=1",
+        "https://a/{z}/{x}/{y}?v=2&sig=abc",
+        "https://a/{z}/{x}/{y}?auth=abc",
+        "https://a/{z}/{x}/{y}?x=1;subscription-key=abc",
+        "https://user:abc@a/{z}/{x}/{y}",
+        "https://a/9f86d081884c7d659a2feaabc/{z}/{x}/{y}",
+    ):
+        with pytest.raises(SettingsError, match="what looks like a key") as caught:
             TileService(url, GRID, 3, tmp_path)
         assert "abc" not in str(caught.value)
+    for url in (
+        "https://a/arcgis/rest/services/World_Imagery_2021_12/MapServer/tile/{z}/{y}/{x}",
+        "https://xdworld.vworld.kr/2d/Satellite/service/{z}/{x}/{y}.jpeg?signed=no&design=4",
+        "https://mts{s}.a/vt/lyrs=s&x={x}&y={y}&z={z}",
+        "https://a/styles/satellite-streets-v12/tiles/{z}/{x}/{y}@2x",
+    ):
+        TileService(url.replace("{s}", "1").replace("signed=no&", ""), GRID, 3, tmp_path)
     TileService("https://a/{z}/{x}/{y}?apikey={key}", GRID, 3, tmp_path, key_env="K")
     with pytest.raises(SettingsError, match="key_env"):
         TileService("https://a/{key}/{z}/{x}/{y}", GRID, 3, tmp_path)
@@ -429,3 +444,22 @@ def test_mbtiles(tmp_path: Path) -> None:
         MBTiles.open(tmp_path / "junk.mbtiles")
     with pytest.raises(MissingInputError, match=r"no\.mbtiles"):
         MBTiles.open(tmp_path / "no.mbtiles")
+
+
+@pytest.mark.parametrize("value", ["text", 1.5, 7])
+def test_a_tile_of_mbtiles_that_is_no_blob_is_named(tmp_path: Path, value: object) -> None:
+    make_mbtiles(tmp_path / "a.mbtiles", {(2, 1, 1): tile_image("a")})
+    with closing(sqlite3.connect(tmp_path / "a.mbtiles")) as db, db:
+        db.execute("UPDATE tiles SET tile_data = ?", (value,))
+    source = MBTiles.open(tmp_path / "a.mbtiles")
+    with pytest.raises(InputError, match=r"^tile 2/1/2 in .*a\.mbtiles: it is (str|float|int) .*, no image"):
+        source.read(Tile(1, 2))
+
+
+@pytest.mark.parametrize("level", ["x", 1.5, -1, 99])
+def test_a_level_of_mbtiles_that_is_none_is_said(tmp_path: Path, level: object) -> None:
+    make_mbtiles(tmp_path / "a.mbtiles", {(2, 1, 1): tile_image("a")})
+    with closing(sqlite3.connect(tmp_path / "a.mbtiles")) as db, db:
+        db.execute("UPDATE tiles SET zoom_level = ?", (level,))
+    with pytest.raises(InputError, match="is no zoom level"):
+        MBTiles.open(tmp_path / "a.mbtiles")

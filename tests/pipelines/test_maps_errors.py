@@ -172,7 +172,8 @@ def test_imagery_of_another_place(region: SmallRegion, maps: Callable[[], Answer
         image, "w", "GTiff", 64, 64, 3, "EPSG:5187", rasterio.Affine(1, 0, 300_000, 0, -1, 500_000), "uint8"
     ) as dst:
         dst.write(np.full((3, 64, 64), 90, np.uint8))
-    region.edit('kind = "tiles"\npath = "tiles"', 'kind = "raster"\npath = "ortho.tif"')
+    tiles = f'kind = "tiles"\npath = "tiles"\ngrid = "kakao"\nlevel = {LEVEL}'
+    region.edit(tiles, 'kind = "raster"\npath = "ortho.tif"')
     says(maps(), "ortho.tif", "km away")
     image.write_bytes(b"II*\0junk")
     says(maps(), "ortho.tif", "not a readable image")

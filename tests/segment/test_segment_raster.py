@@ -76,3 +76,27 @@ def test_a_fault_says_which_parameter_mends_it(
         pass
     assert caught.value.needs == needs
     assert "--" not in str(caught.value)
+
+
+def test_a_raster_of_a_million_rows_and_columns_is_refused_before_work_begins(
+    tmp_path: Path, segmenter: Segmenter
+) -> None:
+    # Sparse: no block is stored, so the file is small.
+    profile = {
+        "driver": "GTiff",
+        "count": 3,
+        "height": 10**6,
+        "width": 10**6,
+        "dtype": "uint8",
+        "tiled": True,
+    }
+    with rasterio.open(
+        tmp_path / "a.tif", "w", crs="EPSG:5187", transform=PLACE, blockxsize=4096, blockysize=4096, bigtiff="yes",
+        sparse_ok=True, **profile,
+    ):  # fmt: skip
+        pass
+    with (
+        pytest.raises(BrmgeoError, match=r"1000000 x 1000000 px at 0\.5 m, days of work"),
+        open_raster(tmp_path / "a.tif", segmenter),
+    ):
+        pass
