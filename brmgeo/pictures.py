@@ -10,36 +10,16 @@ from typing import Any
 
 import cv2
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 from PIL import Image
 
-from brmgeo.errors import InputError, MissingInputError
+from brmgeo.errors import InputError, MissingInputError, one_line
 from brmgeo.files import told
 
 #: Endings of the picture files that are looked for in folders.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-
-
-def fault_of(data: bytes) -> str | None:
-    """What is wrong with the bytes of a picture file, in a few words; None for a whole picture.
-
-    OpenCV fills up what is missing of a picture with grey and says nothing; Pillow refuses it. So it is decoded twice, which
-    costs three milliseconds a 640 x 480 JPEG.
-    """
-    if not data:
-        return "the file is empty"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large pictures and odd tags, which do not matter here
-            with Image.open(io.BytesIO(data)) as shown:
-                shown.load()
-    except Image.DecompressionBombError:
-        return "too many pixels for one picture"
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
-        if data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error):
-            return f"damaged or cut short ({error})"
-    return None
+_JPEG_FLAGS = (cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR, cv2.IMREAD_GRAYSCALE)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -59,19 +39,54 @@ def decode(data: bytes, name: str, *, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
         name: of the file, for messages.
         flags: OpenCV's; an EXIF turn is never applied.
 
-    Raises InputError, naming the file, for what is empty, cut short, damaged or no picture.
+    Raises InputError, naming the file, for what is empty, cut short, damaged or no picture: whatever its decoder warns of.
     """
-    fault = fault_of(data)
-    image = None
-    if fault is None:
+    if not data:
+        raise _faulty(name, "the file is empty")
+    image = _jpeg(data, name, flags) if data[:2] == b"\xff\xd8" else None
+    if image is None:
+        _require_whole(data, name)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
-            fault = "no picture that can be decoded"
-    if image is None:
-        raise InputError(f"{name}: {fault}: copy it again, or convert it to PNG or JPEG")
-    if image.ndim == 3 and image.shape[2] >= 3:
-        image = image[:, :, [2, 1, 0, 3][: image.shape[2]]]
+            raise _faulty(name, "no picture that can be decoded")
+        if image.ndim == 3 and image.shape[2] >= 3:
+            image = image[:, :, [2, 1, 0, 3][: image.shape[2]]]
     return np.ascontiguousarray(image)
+
+
+def _faulty(name: str, fault: str) -> InputError:
+    return InputError(f"{name}: {fault}: copy it again, or convert it to PNG or JPEG")
+
+
+def _jpeg(data: bytes, name: str, flags: int) -> NDArray[Any] | None:
+    """A JPEG's pixels, the same as OpenCV's, by a decoder whose warnings are errors; None for one that it does not know.
+
+    OpenCV fills up what is missing of a picture with grey and says nothing of what it could not make sense of.
+    """
+    try:
+        _, _, colours, _ = simplejpeg.decode_jpeg_header(data)
+        if colours not in ("Gray", "YCbCr", "RGB") or flags not in _JPEG_FLAGS:
+            return None
+        grey = flags == cv2.IMREAD_GRAYSCALE or (flags == cv2.IMREAD_UNCHANGED and colours == "Gray")
+        image = simplejpeg.decode_jpeg(data, colorspace="GRAY" if grey else "RGB", strict=True)
+    except ValueError as error:
+        raise _faulty(name, f"damaged or cut short ({one_line(error, 120)})") from None
+    return image[:, :, 0] if grey else image
+
+
+def _require_whole(data: bytes, name: str) -> None:
+    """InputError for a picture that Pillow calls damaged, and OpenCV fills up."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large pictures and odd tags, which do not matter here
+            with Image.open(io.BytesIO(data)) as shown:
+                shown.load()
+    except Image.DecompressionBombError:
+        raise _faulty(name, "too many pixels for one picture") from None
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
+        if data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error):
+            raise _faulty(name, f"damaged or cut short ({error})") from None
 
 
 def encode(

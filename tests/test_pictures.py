@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from rasterio.enums import ColorInterp
 
 from brmgeo import pictures
@@ -30,13 +33,67 @@ def test_colours_come_back_as_rgb() -> None:
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_what_is_cut_short_is_told(suffix: str) -> None:
     data = pictures.encode(_picture(), suffix)
-    assert pictures.fault_of(data) is None
+    assert pictures.decode(data, "a.x").shape == (40, 60, 3)
     with pytest.raises(InputError, match=r"a\.x: .*(cut short|no picture)"):
         pictures.decode(data[: len(data) // 2], "a.x")
     with pytest.raises(InputError, match="empty"):
         pictures.decode(b"", "a.x")
     with pytest.raises(InputError, match="no picture"):
         pictures.decode(b"plain text, and long enough", "a.x")
+
+
+def _noise(rows: int = 120, cols: int = 160) -> np.ndarray:
+    return np.random.default_rng(4).integers(0, 255, (rows, cols, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("flags", [cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR, cv2.IMREAD_GRAYSCALE])
+@pytest.mark.parametrize("bands", [1, 3])
+def test_a_jpeg_s_pixels_are_opencv_s(flags: int, bands: int) -> None:
+    data = pictures.encode(_noise() if bands == 3 else _noise()[:, :, 0], ".jpg")
+    wanted = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    got = pictures.decode(data, "a.jpg", flags=flags)
+    assert (got == (wanted[:, :, ::-1] if wanted.ndim == 3 else wanted)).all()
+
+
+def test_damage_within_a_jpeg_is_found_where_pictures_move() -> None:
+    """Bits flipped behind the header, the end marker left: what is not refused has every block at its place, and only its
+    brightness from some block on, or one block, is another."""
+    data = pictures.encode(_noise(), ".jpg", quality=80)
+    whole = pictures.decode(data, "a.jpg", flags=cv2.IMREAD_GRAYSCALE).astype(int)
+    rng = np.random.default_rng(1)
+    first = data.index(b"\xff\xda") + 14
+    refused = moved = 0
+    for _ in range(100):
+        damaged = bytearray(data)
+        damaged[rng.integers(first, len(data) - 2)] ^= 1 << rng.integers(8)
+        try:
+            seen = pictures.decode(bytes(damaged), "a.jpg", flags=cv2.IMREAD_GRAYSCALE).astype(int)
+        except InputError:
+            refused += 1
+        else:
+            slopes = np.abs(np.diff(seen, axis=1) - np.diff(whole, axis=1))
+            moved += bool((slopes > 6).mean() > 0.05)
+    assert refused > 30
+    assert moved <= 2
+
+
+def test_what_a_camera_appends_is_no_damage() -> None:
+    data = pictures.encode(_picture(), ".jpg")
+    assert (pictures.decode(data + b"\0" * 500, "a.jpg") == pictures.decode(data, "a.jpg")).all()
+    assert (pictures.decode(data + data, "a.jpg") == pictures.decode(data, "a.jpg")).all()
+
+
+def test_a_damaged_png_is_told() -> None:
+    data = bytearray(pictures.encode(_noise()))
+    data[len(data) // 2] ^= 4
+    with pytest.raises(InputError, match="damaged or cut short"):
+        pictures.decode(bytes(data), "a.png")
+
+
+def test_a_jpeg_of_printing_colours_is_read() -> None:
+    out = io.BytesIO()
+    Image.fromarray(_picture()).convert("CMYK").save(out, "jpeg")
+    assert pictures.decode(out.getvalue(), "a.jpg", flags=cv2.IMREAD_COLOR).shape == (40, 60, 3)
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
