@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -26,6 +27,10 @@ else:
 
 #: Names of scratch files and folders begin with this, beside what they become.
 SCRATCH = ".brmgeo-part-"
+#: The list of what was written into a folder, with digests.
+WRITTEN = ".brmgeo-written.json"
+_BESIDE_SQLITE = ("-wal", "-shm")
+Say = Callable[[str], object]
 # And those of folders that stand aside while another takes their place end with this.
 _OLD = ".old"
 
@@ -153,30 +158,38 @@ def is_deep(value: Any) -> bool:
 
 
 @contextlib.contextmanager
-def whole_files(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+def whole_files(folder: Path, names: Sequence[str], say: Say) -> Iterator[Path]:
     """An empty scratch folder in ``folder`` whose files of these names move there, in this order, when the block ends.
 
     After an error ``folder`` stays as it was. What a killed process left of its scratch folder goes first, so one process
-    at a time may write there.
+    at a time may write there. A file of such a name that is not ours, or was changed, is set aside (``set_aside``).
     """
     scratch = folder / f"{SCRATCH}files"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     try:
         yield scratch
+        set_aside(folder, names, say)
         for name in names:
             os.replace(scratch / name, folder / name)
+        list_written(folder, names)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
 @contextlib.contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
+def whole_folder(
+    out: Path, *, say: Say | None = None, ours: Callable[[Path], bool] = lambda _: False
+) -> Iterator[Path]:
     """An empty scratch folder beside ``out`` that takes its place when the block ends without an error.
 
-    What stood at ``out`` goes with it; after an error it stays as it was. Whoever calls this has made sure that nothing
-    there is missed. What a run killed between the two renames left aside is put back first, and scratch folders of this
-    ``out`` that nobody has touched for an hour are removed.
+    It carries a list of its files with their digests (``WRITTEN``). Without ``say`` only a missing or empty folder is taken
+    the place of, SettingsError else. With it, what stood at ``out`` goes, but for what is not ours (not listed, or changed
+    since): that stays, under its own name, or as ``name.edited.ext`` where a new file has its name, which ``say`` is told.
+    ``ours`` says which files of a folder without a list are ours.
+
+    After an error ``out`` stays as it was. What a run killed between the two renames left aside is put back first, and
+    scratch folders of this ``out`` that nobody has touched for an hour are removed.
     """
     out = out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -186,17 +199,120 @@ def whole_folder(out: Path) -> Iterator[Path]:
     scratch.mkdir()
     try:
         yield scratch
+        list_written(scratch, list(files_below(scratch)))
+        told = _carry(out, scratch, ours) if say is not None and out.is_dir() else []
+        if say is None and out.is_dir() and any(out.iterdir()):
+            raise SettingsError(f"{out} is there by now, made by another run: choose another", needs="out")
         if out.exists():
             os.rename(out, old)
         try:
             os.rename(scratch, out)
         except BaseException:
-            if old.exists():
+            if old.exists() and not out.exists():
                 os.rename(old, out)
             raise
         shutil.rmtree(old, ignore_errors=True)
+        for line in told:
+            assert say is not None
+            say(line)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+# --- what we wrote, and what is not ours ---------------------------------------------------------------------------
+
+
+def list_written(folder: Path, names: Sequence[str]) -> None:
+    """Notes the digests of files in a folder, by names with forward slashes, in its list of what was written."""
+    known = read_json(folder / WRITTEN)
+    known = known if isinstance(known, dict) else {}
+    write_json(folder / WRITTEN, known | {name: content_digest(folder / name) for name in names})
+
+
+def foreign_in(folder: Path) -> list[str] | None:
+    """Names below a folder of files that its list does not have, or has otherwise; None where there is no list."""
+    known = read_json(folder / WRITTEN)
+    if not isinstance(known, dict):
+        return None
+    return [
+        n for n in sorted(_entries(folder)) if n != WRITTEN and not _is_as_written(folder / n, known.get(n))
+    ]
+
+
+def set_aside(folder: Path, names: Sequence[str], say: Say) -> None:
+    """Renames the files of these names that are not ours, or were changed, to ``name.edited.ext``, and says so."""
+    known = read_json(folder / WRITTEN)
+    known = known if isinstance(known, dict) else {}
+    for name in names:
+        path = folder / name
+        if os.path.lexists(path) and not _is_as_written(path, known.get(name)):
+            kept = _edited(path)
+            os.rename(path, kept)
+            say(_kept_line(path, kept))
+
+
+def _carry(old: Path, new: Path, ours: Callable[[Path], bool]) -> list[str]:
+    """What is not ours in a folder also in the one that takes its place; a line for each that lost its name."""
+    foreign = foreign_in(old)
+    if foreign is None:
+        foreign = [name for name in sorted(_entries(old)) if not ours(old / name)]
+    told = []
+    for name in foreign:
+        source, target = old / name, new / name
+        if os.path.lexists(target):
+            if target.is_file() and source.is_file() and content_digest(source) == content_digest(target):
+                continue
+            target = _edited(target)
+            told.append(_kept_line(source, target))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_symlink():
+            os.symlink(os.readlink(source), target)
+        elif source.is_dir():
+            target.mkdir(exist_ok=True)
+        else:
+            try:
+                os.link(source, target)
+            except OSError:  # a file system without links
+                shutil.copy2(source, target)
+    return told
+
+
+def _kept_line(path: Path, kept: Path) -> str:
+    return f"{path}: not as brmgeo wrote it, so it is kept as {kept.name}"
+
+
+def _edited(path: Path) -> Path:
+    """The first free name of ``name.edited.ext``, ``name.edited-2.ext`` and so on."""
+    for number in itertools.count(1):
+        free = path.with_name(f"{path.stem}.edited{f'-{number}' if number > 1 else ''}{path.suffix}")
+        if not os.path.lexists(free):
+            return free
+    raise AssertionError
+
+
+def _entries(folder: Path) -> Iterator[str]:
+    """Names below a folder of files, of links (which are not followed) and of empty folders; no scratch of ours."""
+    for top, folders, names in os.walk(folder):
+        links = [name for name in folders if os.path.islink(os.path.join(top, name))]
+        here = [*names, *links]
+        if not here and not folders and Path(top) != folder:
+            yield Path(top).relative_to(folder).as_posix()
+        for name in here:
+            if not name.startswith(SCRATCH):
+                yield (Path(top) / name).relative_to(folder).as_posix()
+
+
+def _is_as_written(path: Path, known: object) -> bool:
+    """Whether a file is the one that was listed with the digest ``known``; what SQLite keeps beside it goes with it."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    if path.name.endswith(_BESIDE_SQLITE):
+        # Of a database that somebody works on; alone, or without a word in it, nothing is lost.
+        return path.stat().st_size == 0 or not path.with_name(path.name[: -len("-wal")]).is_file()
+    journal = path.with_name(f"{path.name}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        return False
+    return known == content_digest(path)
 
 
 def _tidy(out: Path, older_than_s: float = 3600.0) -> None:
@@ -225,21 +341,28 @@ def _last_touched(folder: Path) -> float:
     return newest
 
 
-def require_replaceable(out: Path, sign: str, what: str, ours: Callable[[Path], bool]) -> None:
-    """Raises SettingsError where ``whole_folder(out)`` would lose what is not ours.
+def require_replaceable(
+    out: Path, sign: str, what: str, ours: Callable[[Path], bool], *, keeps: bool = False
+) -> None:
+    """Raises SettingsError where ``whole_folder(out)`` would lose what is not ours, or ``out`` is none of our folders.
 
     Args:
         out: the folder; one that is not there, or is empty, may be replaced.
         sign: name of the file without which the folder is none of ours.
         what: what ours is called, for the message.
-        ours: True for a path in it that may be lost.
+        ours: True for a path in it that may be lost, where the folder has no list of what was written.
+        keeps: what is not ours in a folder with a list is kept, so it is no hindrance.
     """
     there = sorted(out.iterdir()) if out.is_dir() else []
-    foreign = [p for p in there if not ours(p)] or ([] if not there or (out / sign).is_file() else there)
+    listed = foreign_in(out) if there else None
+    if keeps and listed is not None and (out / sign).is_file():
+        return
+    foreign = [out / n for n in listed] if listed is not None else [p for p in there if not ours(p)]
+    foreign = foreign or ([] if not there or (out / sign).is_file() else there)
     if foreign or out.is_file():
         raise SettingsError(
-            f"{out}: there are other files than {what} ({(foreign or [out])[0].name}), and the folder is replaced as a "
-            "whole: give a new folder or an empty one",
+            f"{out}: there are other files than {what} ({(foreign or [out])[0].name}), or changed ones, and the folder is "
+            "replaced as a whole: give a new folder or an empty one",
             needs="out",
         )
 
@@ -278,6 +401,21 @@ def digest(path: Path) -> str:
     """SHA-256 of a file's content, 64 hexadecimal digits."""
     with open(path, "rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def content_digest(path: Path) -> str:
+    """SHA-256 of what a file says: its ``digest``, but of an SQLite file (GeoPackage) without the counters and modes in its
+    header, which programs change by opening it."""
+    with open(path, "rb") as handle:
+        head = bytearray(handle.read(100))
+        if not head.startswith(b"SQLite format 3\0"):
+            return digest(path)
+        for at, length in ((18, 2), (24, 4), (92, 8)):
+            head[at : at + length] = bytes(length)
+        state = hashlib.sha256(head)
+        while block := handle.read(1 << 20):
+            state.update(block)
+    return state.hexdigest()
 
 
 def digest_of(text: str | bytes | memoryview) -> str:

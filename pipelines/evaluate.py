@@ -9,7 +9,7 @@ from pathlib import Path
 from brmgeo.errors import MissingInputError, SettingsError, WorkflowError
 from brmgeo.evaluate.table import FlightRow, markdown, plain, read_row, rows_csv, summarize
 from brmgeo.evaluate.trials import MASKS, PAPER_ACCURACY, Trial, fly_trial
-from brmgeo.files import write_text
+from brmgeo.files import list_written, set_aside, write_text
 from brmgeo.locate.maps import Maps, read_maps
 from brmgeo.locate.masks import network_name, network_warning
 from brmgeo.match import METHODS
@@ -17,6 +17,8 @@ from brmgeo.synth.mission import path_name
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
 
+#: What is written.
+TABLES = ("flights.csv", "summary.md")
 _SIMULATED = "12 % of buildings missed, 3 false blobs a frame, wobbly edges"
 
 
@@ -58,20 +60,21 @@ def evaluate(what: Evaluation) -> str:
             progress.say(warning)
     rows: list[FlightRow] = []
     broken: list[str] = []
-    table = what.out / "flights.csv"
+    table = what.out / TABLES[0]
     what.out.mkdir(parents=True, exist_ok=True)
+    set_aside(what.out, TABLES, progress.say)
     with scheduler(what.scheduler_spec, say=progress.say) as map, progress.stage("flights") as bar:
         for result in bar.watch(map)(_trial_or_why, what.trials):
             if isinstance(result, str):
                 broken.append(result)
             else:
                 rows += result
-                write_text(table, rows_csv(rows))
+                _write(what.out, TABLES[0], rows_csv(rows))
     if not rows:
         raise WorkflowError(f"evaluate: none of {what.flights} flights could be flown; {broken[0]}")
     note = _note(what, maps, shown, broken)
     summaries = summarize(rows)
-    write_text(what.out / "summary.md", f"{note}\n\n{markdown(summaries)}")
+    _write(what.out, TABLES[1], f"{note}\n\n{markdown(summaries)}")
     if broken:
         raise WorkflowError(
             f"evaluate: {len(broken)} of {what.flights} flights broke off ({broken[0]}); the others are in {table}"
@@ -164,6 +167,12 @@ def compare_results(folders: Sequence[Path], out: Path | None) -> str:
     summaries = summarize(rows)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        write_text(out / "flights.csv", rows_csv(rows))
-        write_text(out / "summary.md", markdown(summaries))
+        set_aside(out, TABLES, Progress().say)
+        _write(out, TABLES[0], rows_csv(rows))
+        _write(out, TABLES[1], markdown(summaries))
     return plain(summaries)
+
+
+def _write(out: Path, name: str, text: str) -> None:
+    write_text(out / name, text)
+    list_written(out, [name])

@@ -53,8 +53,8 @@ READ = {
 
 
 def is_result(path: Path) -> bool:
-    """True for a file by a name that localize writes, or QGIS beside it."""
-    return path.name in RESULTS or ".qgz" in path.suffix
+    """True for a file by a name that localize always wrote, or QGIS beside it; a project may have been edited."""
+    return path.name in RESULTS
 
 
 def source_of(flight: Flight) -> str:

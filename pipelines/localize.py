@@ -42,7 +42,9 @@ def localize(
     """
     if method not in METHODS:
         raise SettingsError(f"METHOD {method!r} is not known: choose one of {', '.join(METHODS)}")
-    require_replaceable(out, "fixes.csv", "results of localize", is_result)
+    require_replaceable(
+        out, "fixes.csv", "results of localize", lambda p: is_result(p) or ".qgz" in p.suffix, keeps=True
+    )
     progress = Progress()
     maps = read_maps(maps_dir.absolute())
     if sift and maps.imagery is None:
@@ -92,7 +94,7 @@ def localize(
             sift=sift,
             attribution=attribution,
         )
-        with whole_folder(out) as scratch:
+        with whole_folder(out, say=progress.say, ours=is_result) as scratch:
             write_results(scratch, out, results)
     report = out / "report.html"
     progress.say(f"{flight.name} by {method}: {results.sentence}; report: {report}")

@@ -56,11 +56,11 @@ def build_maps(
         with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
             made = plan.build(map, progress)
         if "source" in made:
-            publish(made["source"], source_dir, _source_names(made["source"]))
+            publish(made["source"], source_dir, _source_names(made["source"]), progress.say)
         for label, name in PUBLISHED.items():
             if label in made:
-                publish(made[label], out, [name])
-        publish(made["overview"], out, [f"{region.name}.qgz", "preview.png"])
+                publish(made[label], out, [name], progress.say)
+        publish(made["overview"], out, [f"{region.name}.qgz", "preview.png"], progress.say)
         _write_facts(region, made, out / "maps.json")
     fresh = [label for label, artifact in made.items() if artifact.fresh]
     if fresh:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from brmgeo.errors import MissingInputError, SettingsError
-from brmgeo.files import digest, require_replaceable, whole_folder, write_text
+from brmgeo.files import digest, list_written, require_replaceable, whole_folder, write_text
 from brmgeo.flight.folder import may_be_remade
 from brmgeo.geo.raster import box_of
 from brmgeo.locate.maps import Maps, read_maps
@@ -105,7 +105,7 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     file = what.imagery_file(maps)
     native = what.native if what.imagery is None else None
     imagery = None if file is None else imagery_along(route, settings, file, native)
-    with whole_folder(out) as scratch:
+    with whole_folder(out, say=Progress().say, ours=lambda _: True) as scratch:
         simulate(scratch, ground, route, maps.crs, settings, seed, mode=what.mode, imagery=imagery, name=name)
     return out
 
@@ -196,4 +196,5 @@ def default_flight(own: Region, maps_dir: Path, data: Path, seed: int) -> Path:
         native = native_imagery(own, data) if mode != "masks" else None
         simulate_flight(Simulation(maps.folder, own.flight, mode=mode, native=native), seed, out, name)
         write_text(note, recipe)
+        list_written(out, [note.name])
     return out

@@ -138,15 +138,15 @@ def _published_before(out: Path, region: str) -> set[str]:
 
 def publish_tiles(made: Mapping[str, Artifact], names: Mapping[str, str], out: Path) -> None:
     """Puts index and shards (label of each one's step -> its name) in ``out``, and takes away what an earlier cut left."""
-    index = made["tile-index"]
+    index, say = made["tile-index"], Progress().say
     before, wanted = _published_before(out, index.step.settings.region), set(index.record["outputs"])
     for label, name in names.items():
         if (made[label].path / "shard.tar").exists():
-            publish(made[label], out, {"shard.tar": f"{name}.tar"})
+            publish(made[label], out, {"shard.tar": f"{name}.tar"}, say)
             wanted.add(f"{name}.tar")
-    publish(index, out, sorted(index.record["outputs"]))
+    publish(index, out, sorted(index.record["outputs"]), say)
     if "alignment" in made:
-        publish(made["alignment"], out, ["alignment.json"])
+        publish(made["alignment"], out, ["alignment.json"], say)
         wanted.add("alignment.json")
     for stale in before - wanted:
         (out / stale).unlink(missing_ok=True)  # of an earlier cut with other settings

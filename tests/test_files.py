@@ -8,6 +8,7 @@ import os
 import stat
 import subprocess
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -89,22 +90,31 @@ def test_json_is_read_back_and_damage_is_none(tmp_path: Path) -> None:
     assert files.read_json(tmp_path / "gone.json") is None
 
 
+def replaced(out: Path) -> AbstractContextManager[Path]:
+    """A folder whose files may all go."""
+    return files.whole_folder(out, say=print, ours=lambda _: True)
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir() if p.name != files.WRITTEN)
+
+
 def test_a_folder_comes_whole_or_the_old_one_stays(tmp_path: Path) -> None:
     out = tmp_path / "deep" / "out"
-    with files.whole_folder(out) as scratch:
+    with replaced(out) as scratch:
         (scratch / "a").write_text("1")
 
     def half() -> None:
-        with files.whole_folder(out) as scratch:
+        with replaced(out) as scratch:
             (scratch / "b").write_text("2")
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
         half()
-    assert [p.name for p in out.iterdir()] == ["a"]
-    with files.whole_folder(out) as scratch:
+    assert names_in(out) == ["a"]
+    with replaced(out) as scratch:
         (scratch / "b").write_text("2")
-    assert [p.name for p in out.iterdir()] == ["b"]
+    assert names_in(out) == ["b"]
     assert [p.name for p in out.parent.iterdir()] == ["out"]
 
 
@@ -118,7 +128,7 @@ def die(source, target):
     rename(source, target)
     os._exit(9)
 files.os.rename = die
-with files.whole_folder(pathlib.Path({str(out)!r})) as scratch:
+with files.whole_folder(pathlib.Path({str(out)!r}), say=print, ours=lambda _: True) as scratch:
     (scratch / "new").touch()
 """
     run = subprocess.run(
@@ -140,7 +150,7 @@ def test_a_run_killed_between_the_renames_loses_nothing(tmp_path: Path, asked: b
         files.require_writable(out)
 
     def fails() -> None:
-        with files.whole_folder(out):
+        with replaced(out):
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
@@ -148,10 +158,10 @@ def test_a_run_killed_between_the_renames_loses_nothing(tmp_path: Path, asked: b
     assert (out / "old").read_text() == "out"
     # That of a folder with a longer name stays for whoever writes there.
     assert not other.exists()
-    with files.whole_folder(other) as scratch:
+    with replaced(other) as scratch:
         assert (other / "old").read_text() == "out-2"
         (scratch / "new").touch()
-    assert [p.name for p in other.iterdir()] == ["new"]
+    assert names_in(other) == ["new"]
 
 
 def test_scratch_folders_of_killed_runs_are_cleared_after_an_hour(tmp_path: Path) -> None:
@@ -167,22 +177,22 @@ def test_scratch_folders_of_killed_runs_are_cleared_after_an_hour(tmp_path: Path
             # A long run writes deep in its folder only.
             if path.suffix != ".png" or folder != alive:
                 os.utime(path, (1e9, 1e9))
-    with files.whole_folder(out) as scratch:
+    with replaced(out) as scratch:
         (scratch / "b").touch()
     assert {*tmp_path.iterdir()} == {out, other, alive}
-    assert [p.name for p in out.iterdir()] == ["b"]
+    assert names_in(out) == ["b"]
 
 
 def test_several_files_come_together_or_none_does(tmp_path: Path) -> None:
     def write(text: str, *, fails: bool = False) -> None:
-        with files.whole_files(tmp_path, ("a", "b")) as scratch:
+        with files.whole_files(tmp_path, ("a", "b"), print) as scratch:
             for name in ("b", "a", "of the work"):
                 (scratch / name).write_text(text)
             if fails:
                 raise ValueError("on the way")
 
     def there() -> dict[str, str]:
-        return {p.name: p.read_text() for p in tmp_path.iterdir()}
+        return {name: (tmp_path / name).read_text() for name in names_in(tmp_path)}
 
     (tmp_path / "other").write_text("stays")
     write("one")
@@ -293,3 +303,73 @@ def test_json_may_begin_with_a_byte_order_mark() -> None:
     assert files.json_of("\ufeff[1, {}]".encode()) == [1, {}]
     with pytest.raises(ValueError, match="digits"):
         files.json_of("9" * 5000)
+
+
+def _results(out: Path, text: str, say: files.Say) -> None:
+    with files.whole_folder(out, say=say, ours=lambda p: p.name in ("a.csv", "map.qgz")) as work:
+        (work / "a.csv").write_text(text)
+        (work / "map.qgz").write_text(text)
+
+
+def test_a_folder_that_is_replaced_keeps_what_is_not_ours(tmp_path: Path) -> None:
+    out, told = tmp_path / "out", list[str]()
+    _results(out, "first", told.append)
+    (out / "map.qgz").write_text("edited")
+    (out / "my own.qgz").write_text("mine")
+    (out / "notes").mkdir()
+    (out / "notes" / "a.txt").write_text("mine too")
+    (out / "link").symlink_to("notes")
+    (out / "empty").mkdir()
+    _results(out, "second", told.append)
+    assert told == [f"{out / 'map.qgz'}: not as brmgeo wrote it, so it is kept as map.edited.qgz"]
+    assert (out / "a.csv").read_text() == (out / "map.qgz").read_text() == "second"
+    assert (out / "map.edited.qgz").read_text() == "edited"
+    assert (out / "my own.qgz").read_text() == "mine"
+    assert (out / "notes" / "a.txt").read_text() == "mine too"
+    assert os.readlink(out / "link") == "notes"
+    assert (out / "empty").is_dir()
+    (out / "map.qgz").write_text("edited again")
+    _results(out, "third", told.append)
+    assert (out / "map.edited.qgz").read_text() == "edited"
+    assert (out / "map.edited-2.qgz").read_text() == "edited again"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_of_before_there_were_lists_is_ours_by_names(tmp_path: Path) -> None:
+    out, told = tmp_path / "out", list[str]()
+    out.mkdir()
+    for name in ("a.csv", "b.csv"):
+        (out / name).write_text("old")
+    _results(out, "new", told.append)
+    assert (out / "a.csv").read_text() == "new"
+    assert (out / "b.csv").read_text() == "old"
+    assert told == []
+
+
+def test_a_folder_that_must_be_new_is_never_taken_from_another_run(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def twice() -> None:
+        with files.whole_folder(out) as work:
+            (work / "a").touch()
+            with files.whole_folder(out) as other:
+                (other / "b").touch()
+
+    with pytest.raises(SettingsError, match="made by another run"):
+        twice()
+    assert names_in(out) == ["b"]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_files_that_are_replaced_are_set_aside_where_they_are_not_ours(tmp_path: Path) -> None:
+    told = list[str]()
+    for text in ("first", "second"):
+        with files.whole_files(tmp_path, ["a.txt"], told.append) as work:
+            (work / "a.txt").write_text(text)
+    assert told == []
+    (tmp_path / "a.txt").write_text("edited")
+    with files.whole_files(tmp_path, ["a.txt"], told.append) as work:
+        (work / "a.txt").write_text("third")
+    assert (tmp_path / "a.txt").read_text() == "third"
+    assert (tmp_path / "a.edited.txt").read_text() == "edited"
+    assert len(told) == 1

@@ -60,7 +60,7 @@ def finish(
         data={"recipe": recipe.title, "steps": steps, "sources": ground.credits},
         licence=licence_of(ground.credits),
     )  # fmt: skip
-    with whole_files(out, RESULTS) as made:
+    with whole_files(out, RESULTS, say) as made:
         weights = made / "model.safetensors"
         save_weights(weights, tensors_of(state), card)
         asked = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -13,14 +14,18 @@ from brmgeo.workflow.store import Artifact
 PUBLISHED = ".brmgeo-published.json"
 
 
-def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | Iterable[str]) -> list[str]:
+def publish(
+    artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | Iterable[str], say: files.Say
+) -> list[str]:
     """Copies outputs (files, or folders with all in them) to ``out_dir`` under stable names; the names that were written.
 
     ``names`` maps names in the artifact to names in ``out_dir``, or lists names that stay the same. Each file
     is replaced at once, never half written, and only when it is not the one published before: files that an earlier
     artifact put into a published folder and this one lacks are removed. The copies are no links, since programs like
-    QGIS write into the files that they open. Raises WorkflowError when ``out_dir`` cannot be written,
-    KeyError when the artifact has no such output.
+    QGIS write into the files that they open. A file that somebody changed since it was published, or that never was, stays
+    as it is while there is nothing newer, and is set aside (``files.set_aside``) where there is; ``say`` is told.
+
+    Raises WorkflowError when ``out_dir`` cannot be written, KeyError when the artifact has no such output.
     """
     out = Path(out_dir).absolute()
     wanted: dict[str, tuple[str, Json]] = {}
@@ -44,20 +49,41 @@ def publish(artifact: Artifact, out_dir: Path | str, names: Mapping[str, str] | 
         before = dict(known)
         try:
             for goal, (source, entry) in sorted(wanted.items()):
-                if goal in known and known[goal] == [entry["sha256"], *_look(out / goal)]:
+                place, digest = out / goal, entry["sha256"]
+                if goal in known and known[goal] == [digest, *_look(place)]:
                     continue
-                (out / goal).parent.mkdir(parents=True, exist_ok=True)
-                files.copy(artifact.path / source, out / goal)
-                known[goal] = [entry["sha256"], *_look(out / goal)]
+                if os.path.lexists(place) and not _is_published(
+                    place, known.get(goal), artifact.path / source
+                ):
+                    if goal in known and known[goal][0] == digest:
+                        say(
+                            f"{place}: changed since brmgeo wrote it, and left as it is: remove it to have it anew"
+                        )
+                        continue
+                    files.set_aside(out, [goal], say)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                files.copy(artifact.path / source, place)
+                known[goal] = [digest, *_look(place)]
                 written.append(goal)
             for goal in [g for g in known if g not in wanted and any(g.startswith(f"{r}/") for r in roots)]:
-                (out / goal).unlink(missing_ok=True)
+                if not os.path.lexists(out / goal) or known[goal][0] == files.digest(out / goal):
+                    (out / goal).unlink(missing_ok=True)
                 del known[goal]
         finally:
             if known != before:
                 files.write_json(out / PUBLISHED, known, durable=True)
         files.sync(out)
     return written
+
+
+def _is_published(place: Path, known: Json, source: Path) -> bool:
+    """Whether a file still is what was published, or what is to be: then nothing is lost with it."""
+    if place.is_symlink() or not place.is_file():
+        return False
+    found = files.content_digest(place)
+    return found == files.content_digest(source) or (
+        known is not None and known[0] in (found, files.digest(place))
+    )
 
 
 def _look(path: Path) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from small_flights import Said
 
+from brmgeo import files
 from brmgeo.evaluate.table import FlightRow
 from brmgeo.evaluate.trials import Trial
 from brmgeo.match import METHODS
@@ -106,7 +107,7 @@ def test_evaluate_keeps_the_flights_that_were_flown_where_one_breaks_off(
     summary = (out / "summary.md").read_text(encoding="utf-8")
     assert "2 simulated masks-only flights" in summary
     assert "seed 2: ValueError" in summary
-    assert sorted(p.name for p in out.iterdir()) == ["flights.csv", "summary.md"]
+    assert sorted(p.name for p in out.iterdir()) == [files.WRITTEN, "flights.csv", "summary.md"]
 
 
 def test_the_same_flights_with_several_kinds_of_masks(

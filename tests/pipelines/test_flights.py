@@ -53,7 +53,7 @@ def rewrite_rows(path: Path, change: Callable[[list[list[str]]], list[list[str]]
 @pytest.mark.parametrize("method", METHODS)
 def test_result_files_agree_with_each_other(whole: Path, results: Path, method: str) -> None:
     out = results / method
-    assert {p.name for p in out.iterdir()} == RESULTS | {"simulated-1.qgz"}
+    assert {p.name for p in out.iterdir()} == RESULTS | {"simulated-1.qgz", files.WRITTEN}
     assert not [p for p in results.iterdir() if p.name.startswith(".")]
 
     with open(out / "fixes.csv", newline="") as handle:
@@ -153,7 +153,7 @@ def test_same_inputs_same_bytes(maps: Path, whole: Path, results: Path, tmp_path
     localize(maps, read_flight(whole), "mask", tmp_path / "b")
     a, b = bytes_of(tmp_path / "a"), bytes_of(tmp_path / "b")
     assert a.keys() == b.keys()
-    timed = {"metrics.json", "report.html"}
+    timed = {"metrics.json", "report.html", files.WRITTEN}
     # GeoPackage notes the time of its last change in two places of its own tables.
     differ = {n for n in a if a[n] != b[n]} - timed
     assert differ <= {"trajectory.gpkg"}, differ
@@ -197,7 +197,10 @@ def test_maps_need_only_one_file_and_reference_is_not_needed(
     out = tmp_path / "out"
     said = say("localize", "--maps", one, "--flight", flight, "--out", out)
     assert said.code == 0, said.err
-    assert {p.name for p in out.iterdir()} == (RESULTS - {"metrics.json"}) | {"simulated-1.qgz"}
+    assert {p.name for p in out.iterdir()} == (RESULTS - {"metrics.json"}) | {
+        "simulated-1.qgz",
+        files.WRITTEN,
+    }
     (one / "buildings.tif").unlink()
     said = say("localize", "--maps", one, "--flight", flight, "--out", tmp_path / "none")
     assert "buildings.tif is not there" in said.line
@@ -444,11 +447,48 @@ def test_folders_with_other_files_are_never_replaced(
     assert {p.name for p in tmp_path.iterdir()} == {"mine", "flight"}
 
 
-def test_results_are_replaced(results: Path, tmp_path: Path) -> None:
-    ours = tmp_path / "ours"
-    shutil.copytree(results / "paper", ours)
-    (ours / "simulated-1.qgz~").write_bytes(b"of QGIS")
-    files.require_replaceable(ours, "fixes.csv", "results", flight_results.is_result)
+def test_results_are_replaced_and_what_is_not_theirs_stays(
+    maps: Path, whole: Path, results: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(results / "ratio", out)
+    (out / "my own project.qgz").write_bytes(b"mine")
+    (out / "simulated-1.qgz").write_bytes(b"edited")
+    (out / "fixes.csv").write_text("also edited")
+    said = say("localize", "--maps", maps, "--flight", whole, "--method", "ratio", "--out", out)
+    assert said.code == 0
+    assert (out / "my own project.qgz").read_bytes() == b"mine"
+    assert (out / "simulated-1.edited.qgz").read_bytes() == b"edited"
+    assert (out / "fixes.edited.csv").read_text() == "also edited"
+    assert (out / "fixes.csv").read_bytes() == (results / "ratio" / "fixes.csv").read_bytes()
+    assert (
+        f"{out / 'simulated-1.qgz'}: not as brmgeo wrote it, so it is kept as simulated-1.edited.qgz"
+        in said.err
+    )
+
+
+def test_results_of_before_there_were_lists_are_replaced_but_for_projects(
+    maps: Path, whole: Path, results: Path, tmp_path: Path, say: Callable[..., Said]
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(results / "ratio", out)
+    (out / files.WRITTEN).unlink()
+    (out / "simulated-1.qgz~").write_bytes(b"of QGIS")
+    said = say("localize", "--maps", maps, "--flight", whole, "--method", "ratio", "--out", out)
+    assert said.code == 0
+    assert {p.name for p in out.iterdir()} - RESULTS == {files.WRITTEN, "simulated-1.qgz", "simulated-1.qgz~"}
+
+
+def test_a_simulated_flight_that_somebody_changed_is_not_replaced(
+    maps: Path, flight: Path, say: Callable[..., Said], waypoints: Path
+) -> None:
+    words = ("simulate", "--maps", maps, "--mode", "masks", "--path", waypoints, "--out", flight)
+    edit(flight / "flight.toml", "name =", "# Mine now\nname =")
+    before = bytes_of(flight)
+    assert "(flight.toml), or changed ones" in say(*words).line
+    assert bytes_of(flight) == before
+    edit(flight / "flight.toml", "# Mine now\nname =", "name =")
+    assert say(*words).code == 0
 
 
 def test_sift_is_refused_where_it_cannot_be(

@@ -123,14 +123,18 @@ def test_damage_in_the_store_is_found_and_mended(built: SmallRegion, tmp_path: P
     assert states(region, capsys) == dict.fromkeys(STAGES, "fresh")
 
 
-def test_results_that_were_removed_or_edited_come_back(
+def test_results_that_were_removed_come_back_and_those_that_were_edited_stay(
     built: SmallRegion, tmp_path: Path, capsys: Capture
 ) -> None:
     region = built.copied_to(tmp_path / "data")
     (region.out / "ratio.tif").unlink()
     (region.out / "maps.json").unlink()
-    (region.out / "buildings.tif").write_bytes(b"edited")
-    assert brmgeo(capsys, "maps", "small", "--data", region.data).status == 0
+    project = region.out / "small.qgz"
+    project.write_bytes(b"edited")
+    said = brmgeo(capsys, "maps", "small", "--data", region.data)
+    assert said.status == 0
+    assert f"{project}: changed since brmgeo wrote it, and left as it is" in said.err
+    assert project.read_bytes() == b"edited"
     assert rasters_of(region.out) == rasters_of(built.out)
     assert (region.out / "maps.json").is_file()
 

@@ -12,6 +12,7 @@ import os
 import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,7 @@ import workflow_toys as toys
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brmgeo import files
 from brmgeo.errors import InputError, MissingInputError, WorkflowError
 from brmgeo.workflow.publish import publish
 from brmgeo.workflow.schedule import serial_map
@@ -463,9 +465,9 @@ def test_publishing_to_a_full_disk_keeps_the_old_result(small_disk: Path, tmp_pa
     store = Store(tmp_path / "store")
     small = store.build(store.step(toys.FILL, {}, toys.Fill(4)), serial_map)
     large = store.build(store.step(toys.FILL, {}, toys.Fill(64)), serial_map)
-    publish(small, small_disk / "out", ["big.bin"])
+    publish(small, small_disk / "out", ["big.bin"], print)
     with pytest.raises(WorkflowError, match="the disk is full") as error:
-        publish(large, small_disk / "out", ["big.bin"])
+        publish(large, small_disk / "out", ["big.bin"], print)
     one_line(error)
     assert (small_disk / "out" / "big.bin").read_bytes() == (small.path / "big.bin").read_bytes()
     assert sorted(p.name for p in (small_disk / "out").iterdir()) == [".brmgeo-published.json", "big.bin"]
@@ -494,7 +496,7 @@ def test_read_only_store_is_one_line(small_disk: Path, source: Path) -> None:
     for attempt in (
         lambda: store.build(step, serial_map),
         lambda: Store(small_disk / "another"),
-        lambda: publish(made, small_disk / "out", ["words.txt"]),
+        lambda: publish(made, small_disk / "out", ["words.txt"], print),
         lambda: store.lock("toy").__enter__(),
     ):
         with pytest.raises(WorkflowError, match="read-only") as error:
@@ -596,45 +598,80 @@ def test_publish_follows_the_store(store: Store, source: Path, tmp_path: Path) -
     out = tmp_path / "out"
     first = words(store, source, times=2)
     names = {"words.txt": "results/all words.txt", "parts": "parts"}
-    assert len(publish(first, out, names)) == 1 + 10
-    assert publish(first, out, names) == []
+    assert len(publish(first, out, names, print)) == 1 + 10
+    assert publish(first, out, names, print) == []
     second = words(store, source)
-    assert publish(second, out, names) == ["results/all words.txt"]  # the parts that stay have the same bytes
+    assert publish(second, out, names, print) == [
+        "results/all words.txt"
+    ]  # the parts that stay have the same bytes
     assert (out / "results" / "all words.txt").read_text() == "A BRIDGE OVER THE RIVER\n"
     assert sorted(p.name for p in (out / "parts").iterdir()) == [f"{i}.txt" for i in range(5)]
 
 
-def test_publish_repairs_changed_and_removed_results_only(store: Store, source: Path, tmp_path: Path) -> None:
+def test_publish_puts_back_what_is_gone_and_keeps_what_somebody_changed(
+    store: Store, source: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
+    told: list[str] = []
     made = words(store, source)
-    publish(made, out, ["words.txt", "parts"])
+    publish(made, out, ["words.txt", "parts"], told.append)
     (out / "mine.txt").write_text("a user's own file")
     (out / "parts" / "mine.txt").write_text("a user's own file")
-    with open(out / "words.txt", "a") as handle:  # as QGIS writes into a GeoPackage that it opens
-        handle.write("scribble")
+    (out / "words.txt").write_text("edited")
     (out / "parts" / "2.txt").unlink()
-    assert publish(made, out, ["words.txt", "parts"]) == ["parts/2.txt", "words.txt"]
-    assert store.verify(made) == []
-    assert (out / "words.txt").read_bytes() == (made.path / "words.txt").read_bytes()
+    assert told == []
+    assert publish(made, out, ["words.txt", "parts"], told.append) == ["parts/2.txt"]
+    assert told == [
+        f"{out / 'words.txt'}: changed since brmgeo wrote it, and left as it is: remove it to have it anew"
+    ]
+    newer = words(store, source, times=2)
+    assert "words.txt" in publish(newer, out, ["words.txt", "parts"], told.append)
+    assert told[1:] == [f"{out / 'words.txt'}: not as brmgeo wrote it, so it is kept as words.edited.txt"]
+    assert (out / "words.txt").read_bytes() == (newer.path / "words.txt").read_bytes()
+    assert (out / "words.edited.txt").read_text() == "edited"
     assert (out / "mine.txt").exists()
     assert (out / "parts" / "mine.txt").exists()
+    assert store.verify(made) == []
+
+
+def test_publish_sets_aside_what_it_never_wrote(store: Store, source: Path, tmp_path: Path) -> None:
+    (tmp_path / "words.txt").write_text("mine")
+    told: list[str] = []
+    assert publish(words(store, source), tmp_path, ["words.txt"], told.append) == ["words.txt"]
+    assert (tmp_path / "words.edited.txt").read_text() == "mine"
+    assert len(told) == 1
+
+
+def test_a_geopackage_that_was_only_opened_is_not_changed(tmp_path: Path) -> None:
+    path = tmp_path / "a.gpkg"
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("CREATE TABLE t (x)")
+    before, whole = files.content_digest(path), files.digest(path)
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as db:
+        db.execute("PRAGMA journal_mode = wal")
+        db.execute("PRAGMA journal_mode = delete")
+    assert files.digest(path) != whole
+    assert files.content_digest(path) == before
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("INSERT INTO t VALUES (1)")
+    assert files.content_digest(path) != before
 
 
 def test_publish_without_its_memory_writes_again(store: Store, source: Path, tmp_path: Path) -> None:
     made = words(store, source)
-    publish(made, tmp_path / "out", ["words.txt"])
+    publish(made, tmp_path / "out", ["words.txt"], print)
     (tmp_path / "out" / ".brmgeo-published.json").write_text("{broken")
-    assert publish(made, tmp_path / "out", ["words.txt"]) == ["words.txt"]
+    assert publish(made, tmp_path / "out", ["words.txt"], print) == ["words.txt"]
 
 
 def test_publish_of_an_unknown_output_is_a_defect(store: Store, source: Path, tmp_path: Path) -> None:
     with pytest.raises(KeyError, match=r"no output word\.txt"):
-        publish(words(store, source), tmp_path, ["word.txt"])
+        publish(words(store, source), tmp_path, ["word.txt"], print)
 
 
 def test_publish_under_a_file_is_one_line(store: Store, source: Path, tmp_path: Path) -> None:
     made = words(store, source)
     (tmp_path / "file").write_text("")
     with pytest.raises(WorkflowError, match="a file stands where a folder is wanted") as error:
-        publish(made, tmp_path / "file", ["words.txt"])
+        publish(made, tmp_path / "file", ["words.txt"], print)
     one_line(error)

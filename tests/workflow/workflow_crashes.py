@@ -32,8 +32,8 @@ def job(folder: Path, times: int) -> None:
     plan = toy_plan(folder / "store", folder / "source.txt", times=times)
     with plan.store.lock("toy"):
         made = plan.build()
-        publish(made["words"], folder / "out", ["words.txt", "parts"])
-        publish(made["squares"], folder / "out", ["squares.txt"])
+        publish(made["words"], folder / "out", ["words.txt", "parts"], print)
+        publish(made["squares"], folder / "out", ["squares.txt"], print)
 
 
 def job_killed_at(folder: Path, times: int, kill_at: int) -> bool:
