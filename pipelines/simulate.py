@@ -128,13 +128,13 @@ def _simulate_one(job: tuple[Simulation, int, Path, str]) -> Path:
 
 def require_simulated(out: Path) -> None:
     """SettingsError when ``out`` holds anything but a flight that was simulated: a real one is flown but once."""
-    require_replaceable(out, "flight.toml", "a simulated flight", lambda p: p.name in SIMULATED)
     if (out / "flight.toml").is_file() and not may_be_remade(out):
         raise SettingsError(
             f"{out}: there is a flight that brmgeo did not simulate (its flight.toml does not say simulated = true), and it "
             "would be lost; give a new folder or an empty one",
             needs="out",
         )
+    require_replaceable(out, "flight.toml", "a simulated flight", lambda p: p.name in SIMULATED)
 
 
 def other_day(own: Region, maps_dir: Path, season: str, seed: int, out: Path) -> Path:
