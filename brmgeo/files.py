@@ -394,6 +394,47 @@ def plain_name(text: str, otherwise: str) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in text).strip(".-") or otherwise
 
 
+# --- scratch in the temporary folder -----------------------------------------------------------------------------
+
+_HELD = ".brmgeo-scratch"
+
+
+@contextlib.contextmanager
+def scratch_folder(what: str) -> Iterator[Path]:
+    """A folder of this process's own in the system's temporary folder, ``brmgeo-WHAT-...``; removed at the end.
+
+    Folders of the same user's runs that were killed are removed first: nobody holds the lock in them any more.
+    """
+    _sweep(Path(tempfile.gettempdir()))
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f"brmgeo-{what}-"))
+        lock = open_lock(folder / _HELD)
+        # Between these lines another run may have taken the folder for litter.
+        if take_lock(lock, wait=False) and (folder / _HELD).exists():
+            break
+        os.close(lock)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+        shutil.rmtree(folder, ignore_errors=True)  # Windows keeps a lock file as long as it is open
+
+
+def _sweep(temporary: Path) -> None:
+    """Removes scratch folders of this user's whose processes are gone; a link is never followed."""
+    for folder in temporary.glob("brmgeo-*"):
+        with contextlib.suppress(OSError):  # its owner may clear it away just now
+            if folder.is_symlink() or (hasattr(os, "getuid") and folder.lstat().st_uid != os.getuid()):
+                continue
+            lock = os.open(folder / _HELD, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                if take_lock(lock, wait=False):
+                    shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(lock)
+
+
 # --- contents ----------------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -510,9 +509,9 @@ def simulate(
         settings_file=None if settings_file is None else settings_file.absolute(),
     )
     flights = data / "source" / built.name / "flights"
-    with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
+    with files.scratch_folder("day") as scratch:
         if season is not None and built.region is not None:
-            file = Path(scratch) / "other-day.tif"
+            file = scratch / "other-day.tif"
             what = replace(what, imagery=job.other_day(built.region, built.folder, season, seed, file))
         elif built.region is not None and mode != "masks":
             what = replace(what, native=native_imagery(built.region, data))
@@ -759,10 +758,10 @@ def evaluate(
     compared = MaskComparison(kinds, weights, looks) if kinds else None
     if season is not None and (region is None or not (sift or "network" in kinds)):
         raise SettingsError("evaluate --season: needs a generated REGION, and --sift or --masks network")
-    with tempfile.TemporaryDirectory(prefix="brmgeo-") as scratch:
+    with files.scratch_folder("day") as scratch:
         drawn = FrameSource()
         if season is not None and built.region is not None:
-            file = Path(scratch) / "other-day.tif"
+            file = scratch / "other-day.tif"
             other_day(built.region, built.folder, season, first_seed, file)
             drawn = FrameSource(imagery=file, season=season)
         elif built.region is not None and (kinds or sift):

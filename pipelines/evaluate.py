@@ -9,7 +9,7 @@ from pathlib import Path
 from brmgeo.errors import MissingInputError, SettingsError, WorkflowError
 from brmgeo.evaluate.table import FlightRow, markdown, plain, read_row, rows_csv, summarize
 from brmgeo.evaluate.trials import MASKS, PAPER_ACCURACY, Trial, fly_trial
-from brmgeo.files import list_written, set_aside, write_text
+from brmgeo.files import list_written, require_writable, set_aside, write_text
 from brmgeo.locate.maps import Maps, read_maps
 from brmgeo.locate.masks import network_name, network_warning
 from brmgeo.match import METHODS
@@ -61,9 +61,12 @@ def evaluate(what: Evaluation) -> str:
     rows: list[FlightRow] = []
     broken: list[str] = []
     table = what.out / TABLES[0]
-    what.out.mkdir(parents=True, exist_ok=True)
+    require_writable(what.out)
     set_aside(what.out, TABLES, progress.say)
-    with scheduler(what.scheduler_spec, say=progress.say) as map, progress.stage("flights") as bar:
+    with (
+        scheduler(what.scheduler_spec, shared=what.out, say=progress.say) as map,
+        progress.stage("flights") as bar,
+    ):
         for result in bar.watch(map)(_trial_or_why, what.trials):
             if isinstance(result, str):
                 broken.append(result)

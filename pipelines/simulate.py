@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from brmgeo.errors import MissingInputError, SettingsError
-from brmgeo.files import digest, list_written, require_replaceable, whole_folder, write_text
+from brmgeo.files import digest, list_written, require_replaceable, require_writable, whole_folder, write_text
 from brmgeo.flight.folder import may_be_remade
 from brmgeo.geo.raster import box_of
 from brmgeo.locate.maps import Maps, read_maps
@@ -117,8 +117,13 @@ def simulate_flights(
     check_simulation(what)
     for _, out, _ in jobs:
         require_simulated(out)
+    folder = jobs[0][1].absolute().parent
+    require_writable(folder)
     progress = Progress()
-    with scheduler(scheduler_spec, say=progress.say) as map, progress.stage("simulate") as bar:
+    with (
+        scheduler(scheduler_spec, shared=folder, say=progress.say) as map,
+        progress.stage("simulate") as bar,
+    ):
         return list(bar.watch(map)(_simulate_one, [(what, *job) for job in jobs]))
 
 

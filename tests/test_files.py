@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from contextlib import AbstractContextManager
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -262,6 +263,45 @@ print(files.take_lock(d, wait=False))
     assert subprocess.run(run, capture_output=True, text=True, cwd=root).stdout.strip() == "False"
     os.close(held)
     assert subprocess.run(run, capture_output=True, text=True, cwd=root).stdout.strip() == "True"
+
+
+KILLED_WITH_SCRATCH = """
+import sys, time
+from brmgeo import files
+with files.scratch_folder("test") as folder:
+    (folder / "big").write_text("x")
+    print(folder, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_scratch_of_killed_runs_goes_with_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    run = subprocess.Popen(
+        [sys.executable, "-c", KILLED_WITH_SCRATCH],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).resolve().parents[1],
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    assert run.stdout is not None
+    theirs = Path(run.stdout.readline().strip())
+    mine = tmp_path / "brmgeo-results"
+    mine.mkdir()  # not every folder of that name is scratch
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / ".brmgeo-scratch").touch()
+    (tmp_path / "brmgeo-link").symlink_to(elsewhere)
+    with files.scratch_folder("test") as own:
+        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+        assert theirs.is_dir(), "its owner lives"
+        run.kill()
+        run.communicate()
+        with files.scratch_folder("test"):
+            assert not theirs.exists()
+        assert own.is_dir()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["brmgeo-link", "brmgeo-results", "elsewhere"]
+    assert (elsewhere / ".brmgeo-scratch").exists()
 
 
 def test_files_below_a_folder_are_named_from_it(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import math
 import re
 import shutil
 import struct
-import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, KIND_OF_NAME
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.extras import extra
+from brmgeo.files import scratch_folder
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
 from brmgeo.geo.formats import vector_file
 from brmgeo.geo.grid import Bounds
@@ -450,12 +450,12 @@ def _with_index(path: Path) -> Iterator[Path]:
         yield path
         return
     with (
-        tempfile.TemporaryDirectory(prefix="brmgeo-shp-") as folder,
+        scratch_folder("shp") as folder,
         _gdal_option("SHAPE_RESTORE_SHX", "YES"),
     ):
         for part in path.parent.glob(f"{path.stem}.*"):
-            shutil.copyfile(part, Path(folder) / part.name)
-        yield Path(folder) / path.name
+            shutil.copyfile(part, folder / part.name)
+        yield folder / path.name
 
 
 def _only_layer(path: Path) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import json
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from brmgeo.codes import UNKNOWN
 from brmgeo.errors import FlightError, InputError, MissingInputError
-from brmgeo.files import digest_of, write_bytes
+from brmgeo.files import digest_of, scratch_folder, write_bytes
 from brmgeo.flight.camera import slant_gsd_m
 from brmgeo.flight.folder import Flight
 from brmgeo.pictures import decode, encode, read_bytes
@@ -136,8 +135,8 @@ def frame_masks(
     segmenter = Segmenter.load(use.weights, looks=use.looks)
     if warning := trained_over(segmenter.card, region):
         watch.say(f"{flight.name}: {warning}")
-    with tempfile.TemporaryDirectory(prefix="brmgeo-masks-") as scratch:
-        files = _ask(flight, segmenter, use.cache or Path(scratch), watch)
+    with scratch_folder("masks") as scratch:
+        files = _ask(flight, segmenter, use.cache or scratch, watch)
         threshold = segmenter.card.threshold if use.answer == "mask" else None
         runs = {"onnx": "ONNX Runtime", "torch": "torch"}[segmenter.backend]
         shown = "probabilities" if threshold is None else f"masks above {threshold:g}"

@@ -14,21 +14,40 @@ import os
 import signal
 import socket
 import sys
-import tempfile
 import threading
+import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import brmgeo
-from brmgeo.errors import SettingsError, WorkflowError
+from brmgeo import files
+from brmgeo.errors import SettingsError, WorkflowError, one_line
 from brmgeo.workflow.stage import Map, R, T
 
 _MEMORY_SHARE = 0.7
-_CONNECT_S = 5.0
+_LONGEST_GREETING = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Waits:
+    """How long a run waits for others; all in seconds.
+
+    Attributes:
+        answer_s: for an answer of a scheduler or a worker.
+        look_s: between two looks at who is there, while a result is awaited.
+        told_s: without a worker until that is said.
+        end_s: without a worker until the run gives up; a result starts the count again.
+    """
+
+    answer_s: float = 5.0
+    look_s: float = 2.0
+    told_s: float = 10.0
+    end_s: float = 60.0
 
 
 def serial_map(function: Callable[[T], R], items: Iterable[T], /) -> Iterator[R]:
@@ -44,19 +63,22 @@ def scheduler(
     shared: Path | str | None = None,
     workers: int | None = None,
     say: Callable[[str], None] | None = None,
+    waits: Waits = Waits(),
 ) -> Iterator[Map]:
     """The ``map`` that ``spec`` names, closed at the end.
 
     Args:
         spec: ``serial`` (this process), None, empty or ``local`` (a cluster of this machine's own, one thread a
             worker, started when there is work), or the address of a running Dask scheduler such as ``tcp://host:8786``.
-        shared: folder that the workers must see (the store); Dask's warnings go to ``dask.log`` in it.
+        shared: folder that the workers must see (the store, or the results); Dask's warnings go to ``dask.log`` in it. None,
+            for a cluster of this machine: they are dropped.
         workers: workers of a local cluster; the number of CPUs that this process may use by default.
-        say: takes the line that tells the dashboard's address.
+        say: takes the line that tells the dashboard's address, and one when no worker is there any more.
+        waits: how long others are waited for.
 
     Raises SettingsError for another ``spec``; from the first ``map`` on, WorkflowError when the scheduler does not answer,
-    has no workers, or has workers with another brmgeo or without the shared folder, or when workers die
-    again and again over one item.
+    has no workers, or has workers with another brmgeo or without the shared folder, when all workers are gone and none
+    comes back, or when workers die again and again over one item.
     """
     spec = (spec or "local").strip()
     if spec == "serial":
@@ -67,25 +89,29 @@ def scheduler(
         raise SettingsError(
             f"scheduler {spec!r}: give serial, local or an address such as tcp://host:8786", needs="scheduler"
         )
-    cluster = _Dask(
-        address, Path(shared or tempfile.gettempdir()).absolute(), workers, say or (lambda line: None)
-    )
-    try:
+    with contextlib.ExitStack() as stack:
+        folder = Path(shared or stack.enter_context(files.scratch_folder("shared"))).absolute()
+        cluster = _Dask(address, folder, workers, say or (lambda line: None), waits)
+        stack.callback(cluster.close)
         yield cluster.map
-    finally:
-        cluster.close()
 
 
 class _Dask:
     """A Dask cluster that starts with the first work."""
 
     def __init__(
-        self, address: str | None, shared: Path, workers: int | None, say: Callable[[str], None]
+        self,
+        address: str | None,
+        shared: Path,
+        workers: int | None,
+        say: Callable[[str], None],
+        waits: Waits = Waits(),
     ) -> None:
         self._address = address
         self._shared = shared
         self._workers = workers
         self._say = say
+        self._waits = waits
         self._stack = contextlib.ExitStack()
         self._client: Any = None
 
@@ -102,13 +128,13 @@ class _Dask:
         waiting = iter(work)
         flying: deque[Any] = deque()
         try:
-            threads = max(1, sum(client.nthreads().values()))
+            threads = max(1, sum(self._threads(client, 4 * self._waits.answer_s).values()))
             while True:
                 while len(flying) < 2 * threads + 1 and (item := next(waiting, flying)) is not flying:
                     flying.append(client.submit(function, item, pure=False))
                 if not flying:
                     return
-                result: R = flying[0].result()
+                result: R = self._result(client, flying[0], _name(function))
                 flying.popleft().release()
                 yield result
         except KilledWorker as error:
@@ -124,12 +150,60 @@ class _Dask:
             if client.status == "running" and not isinstance(error, gone):
                 raise
             raise WorkflowError(
-                f"{_name(function)}: the scheduler {self._address or 'of this machine'} went away; start it and run again"
+                f"{_name(function)}: {self._where} went away; start it and run again"
             ) from None
         finally:
             for future in flying:
                 with contextlib.suppress(Exception):
                     future.cancel()
+
+    def _threads(self, client: Any, wait_s: float) -> dict[str, int]:
+        """Threads of each worker."""
+        try:
+            threads: dict[str, int] = client.nthreads(callback_timeout=wait_s)
+        except TimeoutError:
+            raise WorkflowError(
+                f"{self._where} does not answer within {wait_s:g} s; start it and its workers again, and run again",
+                needs="scheduler",
+            ) from None
+        return threads
+
+    @property
+    def _where(self) -> str:
+        return f"the scheduler {self._address or 'of this machine'}"
+
+    def _result(self, client: Any, future: Any, name: str) -> Any:
+        """The result of an item, waited for as long as anybody is there to make it."""
+        from distributed import wait
+
+        alone_s, told = 0.0, False
+        since = time.monotonic()
+        while True:
+            try:
+                wait([future], timeout=self._waits.look_s)
+                return future.result(timeout=self._waits.end_s)
+            except TimeoutError:
+                if future.status == "error":
+                    raise
+            try:
+                there = self._threads(client, self._waits.answer_s)
+                missing = "" if there else f"{self._where} has no worker left"
+            except WorkflowError:
+                missing = f"{self._where} does not answer"
+            before, since = since, time.monotonic()
+            if not missing:
+                continue
+            # Workers that come and die again before they finish anything must not make this endless.
+            alone_s += since - before
+            if alone_s >= self._waits.end_s:
+                raise WorkflowError(
+                    f"{name}: {missing}, waited {alone_s:.0f} s for one; start workers again (fewer of them, if they died "
+                    "for lack of memory) or take the scheduler 'serial'; what is finished is kept",
+                    needs="scheduler",
+                )
+            if alone_s >= self._waits.told_s and not told:
+                told = True
+                self._say(f"{name}: {missing}; waiting up to {self._waits.end_s:.0f} s for one to come back")
 
     def close(self) -> None:
         self._client = None
@@ -162,9 +236,11 @@ class _Dask:
             "OPENBLAS_NUM_THREADS": "1",
             "MKL_NUM_THREADS": "1",
         }
-        scratch = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="brmgeo-dask-"))
+        scratch = self._stack.enter_context(files.scratch_folder("dask"))
         self._stack.enter_context(
-            dask.config.set({"distributed.nanny.pre-spawn-environ": threads, "temporary-directory": scratch})
+            dask.config.set(
+                {"distributed.nanny.pre-spawn-environ": threads, "temporary-directory": str(scratch)}
+            )
         )
         log = self._shared / "dask.log"
         self._stack.enter_context(_logs_to(log))
@@ -197,29 +273,41 @@ class _Dask:
     def _connect(self) -> Any:
         assert self._address is not None
         parts = urlsplit(self._address)
+        wait_s = self._waits.answer_s
+        other = f"scheduler {self._address}: something answers there, but not a Dask scheduler of our version"
         try:
-            socket.create_connection((parts.hostname or "", parts.port or 0), timeout=_CONNECT_S).close()
+            with socket.create_connection((parts.hostname or "", parts.port or 0), timeout=wait_s) as probe:
+                # A scheduler greets first, with the length of its greeting, and Dask's client believes any length and waits
+                # for it without end. With TLS the client greets.
+                greets = parts.scheme == "tls" or 0 < _length(probe) <= _LONGEST_GREETING
         except OSError as error:
             raise WorkflowError(
                 f"scheduler {self._address} does not answer ({error.strerror or error}); start it with "
                 "`dask scheduler`, or take this machine's own",
                 needs="scheduler",
             ) from None
+        if not greets:
+            raise WorkflowError(other, needs="scheduler")
         from distributed import Client
 
         self._stack.enter_context(_logs_to(self._shared / "dask.log"))
         try:
-            client = self._stack.enter_context(Client(self._address, timeout=_CONNECT_S))  # type: ignore[no-untyped-call]
+            client = self._stack.enter_context(Client(self._address, timeout=wait_s))  # type: ignore[no-untyped-call]
         except (OSError, TimeoutError, ValueError) as error:
+            raise WorkflowError(f"{other} ({one_line(error)})", needs="scheduler") from None
+        try:
+            count = len(self._threads(client, wait_s))
+            if not count:
+                raise WorkflowError(
+                    f"scheduler {self._address} has no workers; start some with `dask worker {self._address}`"
+                )
+            self._require_same_house(client)
+        except TimeoutError:
             raise WorkflowError(
-                f"scheduler {self._address}: something answers there, but not a Dask scheduler of our version ({error})"
+                f"scheduler {self._address}: one of its workers does not answer within {4 * wait_s:g} s; start it again",
+                needs="scheduler",
             ) from None
-        if not client.nthreads():
-            raise WorkflowError(
-                f"scheduler {self._address} has no workers; start some with `dask worker {self._address}`"
-            )
-        self._require_same_house(client)
-        self._say(f"{len(client.nthreads())} workers of {self._address}, dashboard {client.dashboard_link}")
+        self._say(f"{count} workers of {self._address}, dashboard {client.dashboard_link}")
         return client
 
     def _require_same_house(self, client: Any) -> None:
@@ -227,7 +315,9 @@ class _Dask:
         token = self._shared / f".seen-{uuid.uuid4().hex}"
         token.touch()
         try:
-            answers = client.run(look_around, str(token), on_error="return")
+            answers = client.run(
+                look_around, str(token), on_error="return", callback_timeout=4 * self._waits.answer_s
+            )
         finally:
             token.unlink(missing_ok=True)
         mine = _house()
@@ -245,6 +335,13 @@ class _Dask:
                 raise WorkflowError(
                     f"worker {worker} runs {house}, this is {mine}; install the same brmgeo and Python there and restart it"
                 )
+
+
+def _length(probe: socket.socket) -> int:
+    """The first eight bytes that come, as Dask writes lengths; 0 where fewer come."""
+    with probe.makefile("rb") as stream:
+        head = stream.read(8)
+    return int.from_bytes(head, "little") if len(head) == 8 else 0
 
 
 def _house() -> str:

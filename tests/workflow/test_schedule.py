@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +21,7 @@ import pytest
 import workflow_toys as toys
 
 from brmgeo.errors import FlightError, SettingsError, WorkflowError
-from brmgeo.workflow.schedule import scheduler, serial_map
+from brmgeo.workflow.schedule import Waits, scheduler, serial_map
 from brmgeo.workflow.stage import Map
 from brmgeo.workflow.store import Store
 
@@ -245,7 +248,7 @@ def dask_elsewhere(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[str]]
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(HERE)},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])},
     )
     assert process.stdout is not None
     address = process.stdout.readline().strip()
@@ -275,6 +278,74 @@ def test_external_scheduler(dask_elsewhere: tuple[str, subprocess.Popen[str]], t
         assert "\n" not in str(error.value)
         with pytest.raises(WorkflowError, match="went away"):  # what comes after it fares no better
             list(map(toys.square, range(3)))
+
+
+QUICK = Waits(look_s=0.05, told_s=0.1, end_s=0.6)
+
+
+def test_workers_that_are_gone_for_good_are_told_and_then_given_up(tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    said: list[str] = []
+    with (
+        LocalCluster(
+            n_workers=1, processes=False, protocol="tcp", dashboard_address=None, silence_logs=50
+        ) as cluster,
+        scheduler(cluster.scheduler_address, shared=tmp_path, say=said.append, waits=QUICK) as map,
+    ):
+        results = map(toys.slow_square, range(500))
+        assert next(results) == 0
+        cluster.scale(0)
+        with pytest.raises(
+            WorkflowError, match=r"slow_square: the scheduler tcp\S+ has no worker left, waited"
+        ) as error:
+            list(results)
+        assert "\n" not in str(error.value)
+    assert [line for line in said if "no worker" in line] == [
+        f"slow_square: the scheduler {cluster.scheduler_address} has no worker left; waiting up to 1 s for one to come back"
+    ]
+
+
+def test_a_worker_that_comes_in_time_goes_on(tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    with (
+        LocalCluster(
+            n_workers=1, processes=False, protocol="tcp", dashboard_address=None, silence_logs=50
+        ) as cluster,
+        scheduler(cluster.scheduler_address, shared=tmp_path, waits=Waits(look_s=0.05, told_s=0.1)) as map,
+    ):
+        results = map(toys.slow_square, range(20))
+        assert next(results) == 0
+        cluster.scale(0)
+        time.sleep(0.2)
+        cluster.scale(1)
+        assert list(results) == [x * x for x in range(1, 20)]
+
+
+@pytest.mark.parametrize("answer", [None, b"", b"220\r\n", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_what_answers_but_is_no_scheduler_is_told_soon(answer: bytes | None, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        if answer is not None:
+
+            def speak() -> None:
+                with contextlib.suppress(OSError):
+                    while True:
+                        other, _ = mute.accept()
+                        other.sendall(answer)
+                        other.close()
+
+            threading.Thread(target=speak, daemon=True).start()
+        address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        start = time.monotonic()
+        with (
+            pytest.raises(WorkflowError, match=f"scheduler {address}.* answer") as error,
+            scheduler(address, shared=tmp_path, waits=Waits(answer_s=0.3)) as map,
+        ):
+            list(map(toys.square, range(3)))
+        assert "\n" not in str(error.value)
+        assert time.monotonic() - start < 10
+        mute.shutdown(socket.SHUT_RDWR)
 
 
 def test_workers_with_another_brmgeo_or_disk_are_refused(
