@@ -195,15 +195,15 @@ class _Dask:
                 continue
             # Workers that come and die again before they finish anything must not make this endless.
             alone_s += since - before
-            if alone_s >= self._waits.end_s:
+            if alone_s >= self._waits.told_s and not told:
+                told = True
+                self._say(f"{name}: {missing}; waiting up to {self._waits.end_s:.0f} s for one to come back")
+            elif alone_s >= self._waits.end_s:
                 raise WorkflowError(
                     f"{name}: {missing}, waited {alone_s:.0f} s for one; start workers again (fewer of them, if they died "
                     "for lack of memory) or take the scheduler 'serial'; what is finished is kept",
                     needs="scheduler",
                 )
-            if alone_s >= self._waits.told_s and not told:
-                told = True
-                self._say(f"{name}: {missing}; waiting up to {self._waits.end_s:.0f} s for one to come back")
 
     def close(self) -> None:
         self._client = None
