@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +83,14 @@ class _Command(click.Command):
         self.params.append(click.Option([TRACEBACK], is_flag=True, expose_value=False, hidden=True))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """As click's own, with the option named in the message."""
+        """As click's own, with the option named in the message; numbers that are none, or have no end, are refused."""
+        for param in self.params:
+            value = ctx.params.get(param.name or "")
+            if any(
+                isinstance(v, float) and not isfinite(v)
+                for v in (value if isinstance(value, tuple) else (value,))
+            ):
+                raise click.BadParameter("give finite numbers, not nan or inf", ctx, param)
         try:
             return super().invoke(ctx)
         except BrmgeoError as error:
@@ -443,7 +452,9 @@ def why(region: str, stage: str, data: Path) -> None:
     help="What the camera folder holds.",
 )
 @click.option(
-    "--scale-bias", type=float, help="Scale bias of the odometry, such as 0.05 (default: drawn, sigma 5 %)."
+    "--scale-bias",
+    type=click.FloatRange(-0.9, 10.0),
+    help="Scale bias of the odometry, such as 0.05 (default: drawn, sigma 5 %).",
 )
 @click.option(
     "--season",
@@ -671,7 +682,7 @@ def localize(
 )
 @click.option(
     "--scale-bias",
-    type=float,
+    type=click.FloatRange(-0.9, 0.9),
     default=0.05,
     show_default=True,
     help="Of the odometry, with the sign drawn by seed.",
@@ -1086,6 +1097,7 @@ def odometry(flight: Path, method: str, thin: Path | None, every_s: float) -> No
 
 def main() -> None:
     """Entry point of the ``brmgeo`` command."""
+    clean_up_when_told_to_end()
     sys.exit(last_door(lambda: cli(standalone_mode=False), sys.argv[1:]))
 
 
@@ -1114,6 +1126,23 @@ def last_door(command: Callable[[], Any], words: Sequence[str]) -> int:
         return DEFECT
 
 
+_INTERRUPTED = "brmgeo: interrupted; what was finished is kept, the next run goes on from there"
+
+
+def _end(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_DFL)  # a second one does not wait for what is tidied up
+    raise SystemExit(128 + number)
+
+
+def clean_up_when_told_to_end() -> None:
+    """SIGTERM, and a terminal that closes, end the run as Ctrl-C does: its scratch and its workers go with it."""
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        # What runs under nohup is not to end with its terminal.
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end)
+
+
 def run(command: Callable[[], Any]) -> int:
     """Exit status of a command: 0, 2 for a known error (one line on stderr), 130 when interrupted, 141 for a closed pipe.
 
@@ -1135,10 +1164,12 @@ def run(command: Callable[[], Any]) -> int:
         )
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
-        click.echo(
-            "brmgeo: interrupted; what was finished is kept, the next run goes on from there", err=True
-        )
+        click.echo(_INTERRUPTED, err=True)
         return 130
+    except SystemExit as error:
+        if error.code == 128 + signal.SIGTERM:  # after SIGHUP nobody is there to read it
+            click.echo(_INTERRUPTED, err=True)
+        raise
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
