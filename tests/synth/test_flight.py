@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
-from dataclasses import replace
+import tempfile
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_flights import exact
 
-from brmgeo.errors import InputError
+from brmgeo.errors import InputError, SettingsError
 from brmgeo.flight.camera import pixel_from_point, world_from_camera
 from brmgeo.flight.folder import read_flight
 from brmgeo.flight.motion import motions, yaw_of
@@ -400,8 +404,9 @@ def test_ground_without_buildings_gives_blank_masks() -> None:
 def test_what_cannot_be_flown_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two different points"):
         fly(PATH[:1], SHORT, 0)
-    with pytest.raises(InputError, match="agl_m is 0"):
-        fly(PATH, replace(SHORT, agl_m=0.0), 0)
+    for name, value in (("agl_m", 0.0), ("speed_m_s", math.nan), ("frame_interval_s", math.inf)):
+        with pytest.raises(SettingsError, match=f"the simulated flight: {name}: .* \\(found"):
+            fly(PATH, replace(SHORT, **{name: value}), 0)
     with pytest.raises(InputError, match="needs imagery"):
         simulate(tmp_path / "a", GROUND, PATH, CRS, SHORT, mode="frames")
     (tmp_path / "b").mkdir()
@@ -409,3 +414,32 @@ def test_what_cannot_be_flown_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="new or empty folder"):
         simulate(tmp_path / "b", GROUND, PATH, CRS, SHORT)
     assert frame_name(3) == "frame_00003.jpg"
+
+
+NUMBERS = [
+    (part, field.name)
+    for part, model in (("", SimulationSettings), ("odometry", OdometryErrors))
+    for field in fields(model)
+    if field.name not in ("camera", "mount", "masks", "odometry", "jpeg_quality", "reset_times_s")
+]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.dictionaries(
+        st.sampled_from(NUMBERS),
+        st.floats(-1.0, 10.0) | st.floats(0.0, 1e6) | st.sampled_from([math.nan, math.inf, 5000.0, 1e300]),
+        min_size=1,
+        max_size=2,
+    )
+)
+def test_a_simulated_flight_can_be_read_or_is_refused(given: dict[tuple[str, str], float]) -> None:
+    made = SimulationSettings(camera=Camera.from_fov(64, 48, 43.0))
+    own, odometry = ({name: v for (of, name), v in given.items() if of == part} for part in ("", "odometry"))
+    made = replace(made, **own, odometry=replace(OdometryErrors(), **odometry))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "flight"
+        with contextlib.suppress(SettingsError):
+            simulate(out, GROUND, PATH[:1] + [[0.0, 0.0], [40.0, 0.0]], CRS, made, 1)
+        if out.exists():
+            read_flight(out)

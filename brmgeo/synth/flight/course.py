@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.errors import InputError
 from brmgeo.flight.readings import FloatArray
-from brmgeo.synth.flight.settings import SimulationSettings
+from brmgeo.synth.flight.settings import SimulationSettings, require_possible
 
 RATE_HZ = 100
 
@@ -81,14 +81,12 @@ def _smooth_noise(rng: np.random.Generator, n: int, seconds: float) -> FloatArra
 def fly(path: FloatArray, settings: SimulationSettings, seed: int) -> Course:
     """The true course along ``path`` (k, 2; metres in the map frame) and the instruments' readings at the frames.
 
-    Raises InputError for a path of fewer than two different points, or a speed, interval or height that is not positive.
+    Raises InputError for a path of fewer than two different points, SettingsError for settings out of range.
     """
     path = np.asarray(path, dtype=np.float64)
     if path.ndim != 2 or len(path) < 2 or not np.isfinite(path).all() or not np.ptp(path, axis=0).any():
         raise InputError("a flight path needs at least two different points: give more waypoints")
-    for name in ("speed_m_s", "frame_interval_s", "agl_m"):
-        if not (math.isfinite(getattr(settings, name)) and getattr(settings, name) > 0):
-            raise InputError(f"{name} is {getattr(settings, name)}: give a positive number")
+    require_possible(settings)
     rng = np.random.default_rng([seed, COURSE])
     track = _rounded(path, settings.turn_radius_m)
     track = track[np.r_[True, np.linalg.norm(np.diff(track, axis=0), axis=1) > 1e-6]]

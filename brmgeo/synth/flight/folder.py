@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from brmgeo.errors import InputError
+from brmgeo.errors import FlightError, InputError, SettingsError
+from brmgeo.flight.folder import read_flight
 from brmgeo.flight.readings import FloatArray, Frame, Reference
 from brmgeo.flight.write import FlightParts, rounded, write_flight, write_mask, write_picture
 from brmgeo.geo.crs import LONLAT, convergence_rad, transformer
@@ -44,7 +47,8 @@ def simulate(
         relief: roofs stand where their height puts them; default: in pictures and the masks that go with them.
         lonlat: write the reference as longitude and latitude, else as x, y in ``crs``.
 
-    Raises InputError when ``out`` holds files already, or pictures are wanted without imagery.
+    Raises InputError when ``out`` holds files already, or pictures are wanted without imagery; SettingsError for settings
+    out of range, or of which a flight comes that ``read_flight`` refuses (nothing is left in ``out`` then).
     """
     out = Path(out)
     settings = settings or SimulationSettings()
@@ -81,6 +85,14 @@ def simulate(
         reference_crs=LONLAT if lonlat else crs,
     )
     write_flight(out, rounded(parts))
+    try:
+        read_flight(out)
+    except FlightError as error:
+        shutil.rmtree(out)
+        told = str(error).replace(f"{out}{os.sep}", "")
+        raise SettingsError(
+            f"the simulated flight {parts.name} could not be read again ({told}): choose settings nearer to a real flight's"
+        ) from None
     return out
 
 

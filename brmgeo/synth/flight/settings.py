@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated
 
 from pydantic import Field
 
 from brmgeo.flight.readings import Attitude, Camera
 from brmgeo.region import Share
+from brmgeo.settings import checked
 
-# Least and most of the numbers, held where a file of settings is read.
-NotNegative = Annotated[float, Field(ge=0.0)]
+# Least and most of the numbers, held where a file of settings is read, and where a flight begins.
+NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 Length = Annotated[float, Field(ge=0.1, le=1000.0)]
 
 
@@ -33,7 +34,7 @@ class MaskErrors:
 
     missed: Share = 0.12
     missed_always: Share = 0.5
-    false_blobs: NotNegative = 3.0
+    false_blobs: Annotated[float, Field(ge=0.0, le=1000.0)] = 3.0
     blob_radius_m: Length = 4.0
     edge_sigma_m: NotNegative = 0.5
     edge_scale_m: Length = 3.0
@@ -121,3 +122,8 @@ class SimulationSettings:
     vignette: Share = 0.15
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92
     sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 152.0
+
+
+def require_possible(settings: SimulationSettings) -> None:
+    """Raises SettingsError for a value out of range, from wherever it came."""
+    checked(SimulationSettings, asdict(settings), "the simulated flight")
