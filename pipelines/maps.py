@@ -53,7 +53,9 @@ def build_maps(
     store = Store(store_dir)
     with store.lock(region.name):
         plan = plan_maps(region, store, source_dir, fetch=True)
-        with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
+        with scheduler(
+            scheduler_spec, shared=store.root, log=store.root / "dask.log", say=progress.say
+        ) as map:
             made = plan.build(map, progress)
         if "source" in made:
             publish(made["source"], source_dir, _source_names(made["source"]), progress.say)

@@ -65,7 +65,9 @@ def cut_tiles(region: Region, data: Path, out: Path, scheduler_spec: str | None,
     store = Store(data / "work")
     with results_folder(out, region.name), store.lock(region.name):
         plan, names = plan_tiles(region, store, data, fetch=True, align=align)
-        with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
+        with scheduler(
+            scheduler_spec, shared=store.root, log=store.root / "dask.log", say=progress.say
+        ) as map:
             made = plan.build(map, progress)
         publish_tiles(made, names, out)
     facts = made["tile-index"].facts

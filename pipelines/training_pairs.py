@@ -195,7 +195,9 @@ def cut_pairs(
             sources=(SourceCredit("imagery and masks", attribution, terms),),
         )
         plan.add(INDEX, {"survey": plan.steps[PAIR_SURVEY.name]} | shards, index)
-        with scheduler(scheduler_spec, shared=store.root, say=progress.say) as map:
+        with scheduler(
+            scheduler_spec, shared=store.root, log=store.root / "dask.log", say=progress.say
+        ) as map:
             made = plan.build(map, progress)
         publish_tiles(made, names, out)
     facts = made["pair-survey"].facts

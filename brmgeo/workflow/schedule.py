@@ -61,6 +61,7 @@ def scheduler(
     spec: str | None,
     *,
     shared: Path | str | None = None,
+    log: Path | None = None,
     workers: int | None = None,
     say: Callable[[str], None] | None = None,
     waits: Waits = Waits(),
@@ -70,8 +71,8 @@ def scheduler(
     Args:
         spec: ``serial`` (this process), None, empty or ``local`` (a cluster of this machine's own, one thread a
             worker, started when there is work), or the address of a running Dask scheduler such as ``tcp://host:8786``.
-        shared: folder that the workers must see (the store, or the results); Dask's warnings go to ``dask.log`` in it. None,
-            for a cluster of this machine: they are dropped.
+        shared: folder that the workers must see (the store, or the results).
+        log: file that Dask's warnings are appended to; None drops them.
         workers: workers of a local cluster; the number of CPUs that this process may use by default.
         say: takes the line that tells the dashboard's address, and one when no worker is there any more.
         waits: how long others are waited for.
@@ -91,7 +92,7 @@ def scheduler(
         )
     with contextlib.ExitStack() as stack:
         folder = Path(shared or stack.enter_context(files.scratch_folder("shared"))).absolute()
-        cluster = _Dask(address, folder, workers, say or (lambda line: None), waits)
+        cluster = _Dask(address, folder, log, workers, say or (lambda line: None), waits)
         stack.callback(cluster.close)
         yield cluster.map
 
@@ -103,12 +104,14 @@ class _Dask:
         self,
         address: str | None,
         shared: Path,
+        log: Path | None,
         workers: int | None,
         say: Callable[[str], None],
         waits: Waits = Waits(),
     ) -> None:
         self._address = address
         self._shared = shared
+        self._log = log
         self._workers = workers
         self._say = say
         self._waits = waits
@@ -140,8 +143,7 @@ class _Dask:
         except KilledWorker as error:
             raise WorkflowError(
                 f"{_name(function)}: {error.allowed_failures + 1} workers died one after another over the same item, "
-                f"most often for lack of memory; use smaller blocks or the scheduler 'serial', see "
-                f"{self._shared / 'dask.log'}",
+                f"most often for lack of memory; use smaller blocks or the scheduler 'serial'{self._see}",
                 needs="scheduler",
             ) from None
         except (CancelledError, ClosedClientError, TimeoutError, OSError) as error:
@@ -167,6 +169,10 @@ class _Dask:
                 needs="scheduler",
             ) from None
         return threads
+
+    @property
+    def _see(self) -> str:
+        return f", see {self._log}" if self._log else ""
 
     @property
     def _where(self) -> str:
@@ -242,11 +248,11 @@ class _Dask:
                 {"distributed.nanny.pre-spawn-environ": threads, "temporary-directory": str(scratch)}
             )
         )
-        log = self._shared / "dask.log"
-        self._stack.enter_context(_logs_to(log))
+        self._stack.enter_context(_logs_to(self._log))
         try:
-            cluster = self._stack.enter_context(
-                LocalCluster(  # type: ignore[no-untyped-call]
+            cluster = LocalCluster.__new__(LocalCluster)
+            try:
+                cluster.__init__(  # type: ignore[misc]
                     n_workers=workers,
                     threads_per_worker=1,
                     memory_limit=memory,
@@ -254,14 +260,19 @@ class _Dask:
                     dashboard_address="127.0.0.1:0" if _has_dashboard() else None,
                     silence_logs=logging.WARNING,
                 )
-            )
+            except BaseException:
+                # Interrupted half-way it would go on starting, and end with the process, in scratch that is gone by then.
+                with contextlib.suppress(Exception):
+                    cluster.close()
+                raise
+            self._stack.enter_context(cluster)
             client = self._stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
         except (OSError, RuntimeError, TimeoutError) as error:
             raise WorkflowError(
-                f"the local Dask cluster does not start ({error}); run with the scheduler 'serial', see {log}",
+                f"the local Dask cluster does not start ({error}); run with the scheduler 'serial'{self._see}",
                 needs="scheduler",
             ) from error
-        client.register_plugin(_quiet_worker(log))
+        client.register_plugin(_quiet_worker(self._log))
         where = (
             f"dashboard {cluster.dashboard_link}"
             if _has_dashboard()
@@ -290,7 +301,7 @@ class _Dask:
             raise WorkflowError(other, needs="scheduler")
         from distributed import Client
 
-        self._stack.enter_context(_logs_to(self._shared / "dask.log"))
+        self._stack.enter_context(_logs_to(self._log))
         try:
             client = self._stack.enter_context(Client(self._address, timeout=wait_s))  # type: ignore[no-untyped-call]
         except (OSError, TimeoutError, ValueError) as error:
@@ -358,8 +369,8 @@ def look_around(token: str) -> tuple[bool, str]:
     return os.path.exists(token), _house()
 
 
-def _quiet_worker(log: Path) -> Any:
-    """A worker plugin, so that restarted workers have it too: Dask's warnings go to a file instead of the terminal, and
+def _quiet_worker(log: Path | None) -> Any:
+    """A worker plugin, so that restarted workers have it too: Dask's warnings go to a file, or nowhere, and
     Ctrl-C is for the run alone, which then ends its workers."""
     from distributed import WorkerPlugin
 
@@ -375,8 +386,8 @@ def _quiet_worker(log: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _logs_to(path: Path) -> Iterator[None]:
-    """Dask's and Tornado's warnings go to ``path`` while the body runs."""
+def _logs_to(path: Path | None) -> Iterator[None]:
+    """Dask's and Tornado's warnings go to ``path``, or nowhere, while the body runs."""
     before = _redirect(path)
     try:
         yield
@@ -388,14 +399,14 @@ def _logs_to(path: Path) -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _redirect(path: Path) -> list[tuple[logging.Logger, list[logging.Handler], int, bool]]:
+def _redirect(path: Path | None) -> list[tuple[logging.Logger, list[logging.Handler], int, bool]]:
     import distributed  # noqa: F401  # it sets up its loggers when imported, and would undo this later
 
     before = []
     for name in ("distributed", "distributed.client", "tornado", "bokeh"):
         logger = logging.getLogger(name)
         before.append((logger, logger.handlers, logger.level, logger.propagate))
-        handler = logging.FileHandler(path, delay=True)
+        handler = logging.FileHandler(path, delay=True) if path else logging.NullHandler()
         handler.setFormatter(logging.Formatter("%(asctime)s %(process)d %(name)s %(levelname)s %(message)s"))
         logger.handlers, logger.propagate = [handler], False
         logger.setLevel(logging.WARNING)

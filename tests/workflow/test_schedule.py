@@ -36,7 +36,7 @@ def said() -> list[str]:
 @pytest.fixture(scope="module")
 def two_workers(tmp_path_factory: pytest.TempPathFactory, said: list[str]) -> Iterator[Map]:
     shared = tmp_path_factory.mktemp("shared")
-    with scheduler(None, shared=shared, workers=2, say=said.append) as map:
+    with scheduler(None, shared=shared, log=shared / "dask.log", workers=2, say=said.append) as map:
         yield map
 
 
@@ -372,7 +372,7 @@ def test_workers_that_are_slow_to_leave_do_not_fail_finished_work(
 ) -> None:
     import brmgeo.workflow.schedule as schedule
 
-    dask = schedule._Dask(None, tmp_path, None, lambda line: None)
+    dask = schedule._Dask(None, tmp_path, None, None, lambda line: None)
 
     def slow() -> None:
         raise TimeoutError
