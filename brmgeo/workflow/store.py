@@ -89,6 +89,9 @@ class Artifact:
         return self.step.key
 
 
+#: How long a run may keep others from the folder of work in progress, seconds.
+_CLEANING_S = 60.0
+
 Input = str | Path | Step[Any] | Artifact
 
 
@@ -292,9 +295,17 @@ class Store:
     @contextlib.contextmanager
     def _tmp_lock(self) -> Iterator[None]:
         # Between making a work folder and locking it, a cleaner must not take it for litter.
-        fd = files.open_lock(self.root / "locks" / ".tmp")
+        path = self.root / "locks" / ".tmp"
+        fd = files.open_lock(path)
+        end = time.monotonic() + _CLEANING_S
         try:
-            files.take_lock(fd, wait=True)
+            while not files.take_lock(fd, wait=False):
+                if time.monotonic() > end:
+                    raise WorkflowError(
+                        f"store {self.root}: another run has held {path} for {_CLEANING_S:g} s, to clean up or "
+                        "because it hangs: let it end, or kill it, and run again"
+                    )
+                time.sleep(0.02)
             yield
         finally:
             os.close(fd)

@@ -551,6 +551,16 @@ def test_second_run_of_a_region_is_told_who_works_on_it(store: Store) -> None:
             pass
 
 
+def test_a_store_that_another_run_keeps_closed_is_told(
+    store: Store, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("brmgeo.workflow.store._CLEANING_S", 0.1)
+    step = store.step(toys.WORDS, {"text": source}, toys.Words())
+    with store._tmp_lock(), pytest.raises(WorkflowError, match=r"another run has held \S+\.tmp for 0\.1 s"):
+        store.build(step, serial_map)
+    store.build(step, serial_map)
+
+
 def test_a_run_may_wait_for_the_region(store: Store) -> None:
     code = HOLDER.replace('"busan"', '"toy", wait=True').replace("time.sleep(60)", "")
     with store.lock("toy"):
