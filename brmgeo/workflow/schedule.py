@@ -186,7 +186,7 @@ class _Dask:
         since = time.monotonic()
         while True:
             try:
-                wait([future], timeout=self._waits.look_s)
+                wait([future], timeout=self._waits.look_s)  # type: ignore[no-untyped-call]
                 return future.result(timeout=self._waits.end_s)
             except TimeoutError:
                 if future.status == "error":
