@@ -17,6 +17,7 @@ from brmgeo.locate.maps import Maps, read_maps
 from brmgeo.region import FlightSettings, Region
 from brmgeo.synth.flight import OdometryErrors, SimulationSettings, read_simulation_settings, simulate
 from brmgeo.synth.mission import FineImagery, flight_path, imagery_along, read_ground, simulator_settings
+from brmgeo.workflow.disk import disk_errors
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.stage import Json, canonical, plain
@@ -105,7 +106,8 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     file = what.imagery_file(maps)
     native = what.native if what.imagery is None else None
     imagery = None if file is None else imagery_along(route, settings, file, native)
-    with whole_folder(out, say=Progress().say, ours=lambda _: True) as scratch:
+    place = out.absolute().parent
+    with disk_errors(f"simulate {name}", place), whole_folder(out, say=Progress().say, ours=lambda _: True) as scratch:
         simulate(scratch, ground, route, maps.crs, settings, seed, mode=what.mode, imagery=imagery, name=name)
     return out
 
