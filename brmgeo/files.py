@@ -377,6 +377,22 @@ def require_writable(folder: Path) -> None:
         raise WorkflowError(f"results cannot be written to {folder}: {told(error)}") from None
 
 
+def user_cache() -> Path:
+    """The folder ``brmgeo`` where this system keeps a user's caches; RuntimeError for a user without a home.
+
+    It is for what libraries would else keep in a place of their own, is made when they first write there, and may be
+    deleted at any time.
+    """
+    if sys.platform == "win32":
+        place = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        place = Path.home() / "Library" / "Caches"
+    else:
+        stated = os.environ.get("XDG_CACHE_HOME", "")
+        place = stated if os.path.isabs(stated) else Path.home() / ".cache"
+    return Path(place) / "brmgeo"
+
+
 def sync(path: Path) -> None:
     """Waits until the disk has a file, or the names in a folder; Windows knows no such thing of folders."""
     if sys.platform == "win32" and path.is_dir():

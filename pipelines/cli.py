@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import signal
@@ -123,6 +124,11 @@ class _Group(click.Group):
 )
 def cli() -> None:
     """Tell a drone where it is, without GNSS, from free building maps."""
+    # Else matplotlib makes a folder among the user's settings, and torch one in the temporary folder that stays.
+    with contextlib.suppress(RuntimeError):
+        cache = files.user_cache()
+        os.environ.setdefault("MPLCONFIGDIR", str(cache / "matplotlib"))
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache / "torch"))
 
 
 @cli.command()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import geopandas as gpd
@@ -30,6 +32,23 @@ from pipelines.cli import cli, run
 hypothesis_settings.register_profile("everyday", derandomize=True)
 hypothesis_settings.register_profile("explore", derandomize=False)
 hypothesis_settings.load_profile("everyday")
+
+
+def _forbid_the_network(event: str, arguments: tuple[Any, ...]) -> None:
+    """An audit hook under which Python code reaches this machine alone; no ``except OSError`` hides the failure."""
+    if event in ("socket.connect", "socket.sendto", "socket.sendmsg"):
+        address = arguments[1]
+        host = address[0] if isinstance(address, tuple) else "localhost"  # a path: a socket of this machine
+    elif event in ("socket.getaddrinfo", "socket.gethostbyname"):
+        host = arguments[0] or "localhost"
+    else:
+        return
+    host = host.decode() if isinstance(host, bytes) else host
+    if not host.startswith("127.") and host not in ("localhost", "::1", "0.0.0.0"):
+        raise AssertionError(f"{event} to {host}: tests never leave this machine")
+
+
+sys.addaudithook(_forbid_the_network)
 
 
 @pytest.fixture

@@ -5,4 +5,10 @@ Labels and masks are uint8 everywhere in here: the LABEL codes of ``brmgeo.codes
 unknown out.
 """
 
+import os
+
+# ONNX Runtime's builds for some systems keep a device id in the user's cache folder and look for a host to tell of every
+# session, from their import on. Nothing but this, and before that import, keeps them from it.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
 SPLITS = ("train", "validation", "test")
