@@ -7,8 +7,8 @@ unknown out.
 
 import os
 
-# ONNX Runtime's builds for some systems keep a device id in the user's cache folder and look for a host to tell of every
-# session, from their import on. Nothing but this, and before that import, keeps them from it.
-os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+# ONNX Runtime keeps a device id in the user's cache folder and looks for a host to tell of every session, from its import
+# on. Nothing but this, and before that import, keeps it from that.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
 SPLITS = ("train", "validation", "test")

@@ -195,6 +195,7 @@ def _load_onnx(path: Path, threads: int) -> tuple[_OnnxNetwork, ModelCard]:
 
     from brmgeo.segment.onnx_export import CARD_KEY, check_seal
 
+    ort.disable_telemetry_events()  # those of Windows, which the room's environment variable leaves alone
     data = path.read_bytes()
     check_seal(data, str(path))
     options = ort.SessionOptions()
