@@ -59,7 +59,7 @@ class Seen:
 
 
 def _environment(home: Path) -> dict[str, str]:
-    """A user's first day: an empty home with an empty temporary folder, and no word to any library (CI alone silences some)."""
+    """A first day: an empty home with an empty temporary folder, and no word to any library (`CI` alone silences some)."""
     (home / "tmp").mkdir(parents=True)
     return {
         "HOME": str(home),
