@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -37,8 +38,10 @@ hypothesis_settings.load_profile("everyday")
 def _forbid_the_network(event: str, arguments: tuple[Any, ...]) -> None:
     """An audit hook under which Python code reaches this machine alone; no ``except OSError`` hides the failure."""
     if event in ("socket.connect", "socket.sendto", "socket.sendmsg"):
-        address = arguments[1]
-        host = address[0] if isinstance(address, tuple) else "localhost"  # a path: a socket of this machine
+        ours, address = arguments[:2]
+        if ours.family not in (socket.AF_INET, socket.AF_INET6) or address is None:
+            return  # a socket of this machine, or one that has been connected
+        host = address[0]
     elif event in ("socket.getaddrinfo", "socket.gethostbyname"):
         host = arguments[0] or "localhost"
     else:
