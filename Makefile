@@ -11,7 +11,7 @@ STAMP  := $(VENV)/.installed
 BRMGEO := $(BIN)/brmgeo
 export SCHEDULER
 
-.PHONY: help setup maps tiles train status localize evaluate demo test test-slow qgis-test docs bench bench-odometry lint check clean
+.PHONY: help setup maps tiles train status localize evaluate demo test test-slow stress qgis-test docs bench bench-odometry lint check clean
 
 help:  ## List these commands
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  \033[1m%-14s\033[0m %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -51,6 +51,12 @@ test: setup  ## Run the tests (needs nothing but Python; real data and QGIS only
 
 test-slow: setup  ## Run the long tests too
 	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)
+
+stress: setup  ## Break it by force: kills, damaged files, bombs, full disks, dying workers; laws explored (docs/reliability.md)
+	@status=0; \
+	$(BIN)/pytest -n 2 --dist load -W default $(addprefix tests/stress/,mutations.py losses.py bombs.py disks.py deaths.py kills.py) $(ARGS) || status=1; \
+	$(BIN)/pytest -n 2 --dist loadfile --hypothesis-profile=explore -m "not slow" $$(grep -rl "^from hypothesis" tests --include="test_*.py") || status=1; \
+	exit $$status
 
 qgis-test: maps localize  ## Open the demo's QGIS projects in a real QGIS, check and render them (needs qgis, python3-qgis)
 	@/usr/bin/python3 -c 'import qgis.core' 2>/dev/null || { echo "QGIS is not installed: apt-get install qgis python3-qgis"; exit 2; }

@@ -16,7 +16,8 @@ from formats import OUT, Seed
 Damage = Callable[[bytes, np.random.Generator], tuple[str, bytes]]
 # What a reader says of rows, outlines or pictures that it did not take, with how many.
 _TOLD = re.compile(
-    r"\d.*(left out|lost|damaged|could not|cannot|not be read|unread|skipped|cut short|dropped|missing|not valid|repaired|gaps?\b)"
+    r"\d.*(left out|lost|damaged|could not|cannot|not be read|unread|skipped|cut short|dropped|missing|not valid|"
+    r"repaired|gaps?\b)"
     r"|(left out|lost|damaged|could not|cannot|unread|skipped|cut short|dropped|missing|repaired|warning).*\d",
     re.IGNORECASE,
 )
@@ -70,12 +71,16 @@ def cases(
         if outcome.kind == "accepted" and seed.counts:
             found = seed.counts(out)
             told = any(_TOLD.search(line) for line in set(outcome.said.splitlines()) - before)
-            less = [f"{n}: {found.get(n, 0)} of {w}" for n, w in wanted.items() if found.get(n, 0) < 0.95 * w - 1]
+            less = [
+                f"{n}: {found.get(n, 0)} of {w}" for n, w in wanted.items() if found.get(n, 0) < 0.95 * w - 1
+            ]
             lost = "" if told else ", ".join(less)
         yield Case(file, way, data, outcome, lost)
 
 
-def counted(part: str, name: str, seed: Seed, found: Iterator[Case], keep: Path) -> tuple[Counter[str], list[str]]:
+def counted(
+    part: str, name: str, seed: Seed, found: Iterator[Case], keep: Path
+) -> tuple[Counter[str], list[str]]:
     """Counts of how cases ended, and a line on each that failed; its file and how to repeat it lie below ``keep``."""
     counts: Counter[str] = Counter()
     faults = []

@@ -22,7 +22,9 @@ import pytest
 TESTS = Path(__file__).resolve().parents[1]
 for room in ("flight", "pipelines", "workflow", "stress"):
     sys.path.insert(0, str(TESTS / room))
-COLUMNS = ("tried", "accepted", "refused", "untidy", "traceback", "hang", "memory", "crash", "lost")
+from arena import Arena  # noqa: E402
+
+COLUMNS = ("tried", "accepted", "refused", "untidy", "traceback", "hang", "memory", "crash", "lost", "unseen")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -58,6 +60,33 @@ def kills() -> int:
     return int(os.environ.get("STRESS_KILLS", "4"))
 
 
+@pytest.fixture(scope="session")
+def located(maps: Path, whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What localize wrote of a flight by the two quick methods; never change it."""
+    found = tmp_path_factory.mktemp("located")
+    with Arena(found / "scratch") as made:
+        for method in ("ratio", "paper"):
+            words = (
+                "localize",
+                "--maps",
+                maps,
+                "--flight",
+                whole,
+                "--method",
+                method,
+                "--out",
+                found / "r" / method,
+            )
+            assert made.run("brmgeo", *words).kind == "accepted"
+    return found / "r"
+
+
+@pytest.fixture
+def arena(tmp_path: Path) -> Iterator[Arena]:
+    with Arena(tmp_path / "scratch") as made:
+        yield made
+
+
 Tally = Callable[..., None]
 
 
@@ -85,7 +114,8 @@ def table() -> str:
     commit = subprocess.run(
         ["git", "-C", str(TESTS), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     ).stdout.strip()
-    lines = [f"| part | {' | '.join(COLUMNS)} |", f"|---|{'--:|' * len(COLUMNS)}"]
+    titles = [{"lost": "silent loss"}.get(c, c) for c in COLUMNS]
+    lines = [f"| part | {' | '.join(titles)} |", f"|---|{'--:|' * len(COLUMNS)}"]
     sums: dict[str, Counter[str]] = {}
     for row in rows():
         counts = {c: int(row.get(c, 0)) for c in COLUMNS}

@@ -41,7 +41,9 @@ class Seed:
     text: bool = False
     head: int = 0
     counts: Callable[[Path], dict[str, int]] | None = None
-    kept: Sequence[Path] = field(default_factory=tuple)  # folders that a case may change, put back before the next
+    kept: Sequence[Path] = field(
+        default_factory=tuple
+    )  # folders that a case may change, put back before the next
 
 
 Make = Callable[[Path, pytest.FixtureRequest], Seed]
@@ -188,7 +190,7 @@ def region(folder: Path, more: str = "") -> tuple[Path, Path, tuple[object, ...]
 
 @made("region TOML")
 def _region(folder: Path, request: pytest.FixtureRequest) -> Seed:
-    _, toml, words = region(folder, "[ratio]\nradii_m = [40.0, 17.3]\n[training]\ntile_px = 128\nseed = 3\n")
+    _, toml, words = region(folder, "[ratio]\nradii_m = [40.0, 17.3]\n[training]\ntile_px = 256\nseed = 3\n")
     return Seed((toml,), words, text=True)
 
 
@@ -220,7 +222,7 @@ def _kakao(folder: Path, request: pytest.FixtureRequest) -> Seed:
 def _xyz(folder: Path, request: pytest.FixtureRequest) -> Seed:
     from brmgeo.geo.tilegrid import WebMercatorGrid
 
-    more = '[imagery]\nkind = "tiles"\npath = "tiles"\ngrid = "xyz"\nlevel = 17\nattribution = "me"\n'
+    more = '[imagery]\nkind = "tiles"\npath = "tiles"\ngrid = "webmercator"\nlevel = 17\nattribution = "me"\n'
     data, _, words = region(folder, more)
     tiles, grid = data / "source/small/tiles", WebMercatorGrid()
     tiles_of(17, lambda tile: tiles / grid.path(tile, 17, "jpg"), grid, ".jpg")
@@ -247,7 +249,9 @@ def _mbtiles(folder: Path, request: pytest.FixtureRequest) -> Seed:
 @made("maps.json and records of earlier runs")
 def _records(folder: Path, request: pytest.FixtureRequest) -> Seed:
     data, _, words = region(folder)
-    request.getfixturevalue("arena").run("brmgeo", *("maps", "small", "--data", data, "--out", data / "out/small"))
+    request.getfixturevalue("arena").run(
+        "brmgeo", *("maps", "small", "--data", data, "--out", data / "out/small")
+    )
     files = [*(data / "out").rglob("*.json"), *(data / "work").rglob("*.json")]
     words = (*words[:-1], data / "out/small")
     return Seed(sorted(files), words, text=True, kept=(data / "work", data / "out"))
@@ -310,7 +314,9 @@ def _settings(folder: Path, request: pytest.FixtureRequest) -> Seed:
         "[odometry]\nscale_bias = 0.08\nreset_times_s = [30.0]\n"
     )
     words = ("simulate", "--maps", request.getfixturevalue("maps"), "--mode", "masks", "--out", OUT)
-    return Seed((path,), (*words, "--path", request.getfixturevalue("waypoints"), "--settings", path), text=True)
+    return Seed(
+        (path,), (*words, "--path", request.getfixturevalue("waypoints"), "--settings", path), text=True
+    )
 
 
 @made("path GeoJSON")
@@ -420,9 +426,7 @@ def _euroc(folder: Path, request: pytest.FixtureRequest) -> Seed:
 
 @made("odometry, plain CSV")
 def _csv(folder: Path, request: pytest.FixtureRequest) -> Seed:
-    return poses(
-        folder, "csv", lambda *v: ",".join(f"{n:.9f}" for n in v), "t_s,x,y,z,qw,qx,qy,qz"
-    )
+    return poses(folder, "csv", lambda *v: ",".join(f"{n:.9f}" for n in v), "t_s,x,y,z,qw,qx,qy,qz")
 
 
 # ---------------------------------------------------------------- networks, states, results
@@ -431,7 +435,9 @@ def _csv(folder: Path, request: pytest.FixtureRequest) -> Seed:
 def network(path: Path, folder: Path) -> Seed:
     pictures = folder / "p"
     pictures.mkdir()
-    cv2.imwrite(str(pictures / "a.png"), np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    cv2.imwrite(
+        str(pictures / "a.png"), np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    )
     backend = "torch" if path.suffix == ".safetensors" else "onnx"
     words = ("segment", pictures, "--weights", path, "--backend", backend, "--gsd", 0.3, "--out", OUT)
     return Seed((path,), words)
@@ -466,15 +472,24 @@ def _saved(folder: Path, request: pytest.FixtureRequest) -> Seed:
     from brmgeo.region import FlightSettings
 
     maps, flown = request.getfixturevalue("maps"), read_flight(request.getfixturevalue("whole"))
-    here = Localizer(read_maps(maps), flown.camera, flown.mount, method="paper", settings=match_settings(FlightSettings()))
+    here = Localizer(
+        read_maps(maps), flown.camera, flown.mount, method="paper", settings=match_settings(FlightSettings())
+    )
     frame = flown.frames[0]
-    here.step(frame.t_s, flown.mask(0), Attitude(frame.roll_rad, frame.pitch_rad), frame.agl_m, None, file=frame.file)
+    here.step(
+        frame.t_s,
+        flown.mask(0),
+        Attitude(frame.roll_rad, frame.pitch_rad),
+        frame.agl_m,
+        None,
+        file=frame.file,
+    )
     here.save(folder / "state.brm")
     return Seed((folder / "state.brm",), (folder / "state.brm", maps), call="saved")
 
 
 def results(folder: Path, request: pytest.FixtureRequest, name: str, what: str) -> Seed:
-    there = Path(shutil.copytree(request.getfixturevalue("results") / "paper", folder / "r"))
+    there = Path(shutil.copytree(request.getfixturevalue("located") / "paper", folder / "r"))
     return Seed((there / name,), ("export", there, "--path", what, "--out", f"{OUT}.csv"), text=True)
 
 
@@ -490,12 +505,14 @@ def _fixes(folder: Path, request: pytest.FixtureRequest) -> Seed:
 
 @made("results: trajectory.gpkg")
 def _trajectory(folder: Path, request: pytest.FixtureRequest) -> Seed:
-    seed = results(folder, request, "trajectory.gpkg", "smoothed")
+    seed = results(folder, request, "trajectory.gpkg", "online")
     return Seed(seed.files, seed.words)
 
 
 @made("results: metrics.json, compared")
 def _metrics(folder: Path, request: pytest.FixtureRequest) -> Seed:
-    there = Path(shutil.copytree(request.getfixturevalue("results"), folder / "r"))
-    (there / "paper/metrics.json").write_text(json.dumps(json.loads((there / "paper/metrics.json").read_text()), indent=1))
+    there = Path(shutil.copytree(request.getfixturevalue("located"), folder / "r"))
+    (there / "paper/metrics.json").write_text(
+        json.dumps(json.loads((there / "paper/metrics.json").read_text()), indent=1)
+    )
     return Seed((there / "paper/metrics.json",), ("evaluate", "--results", there, "--out", OUT), text=True)

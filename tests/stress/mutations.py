@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,6 @@ from cases import cases, counted
 from conftest import out
 from damage import damaged
 from formats import FORMATS, seed_of
-
-
-@pytest.fixture
-def arena(tmp_path: Path) -> Iterator[Arena]:
-    with Arena(tmp_path / "scratch") as made:
-        yield made
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -1,0 +1,80 @@
+"""Disks of random sizes that fill up: one line that names the place, and nothing half-written under a result's name."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arena import FAULTS, Arena
+from kills import JOBS, digests, start
+
+# Those whose results all go below one folder.
+NAMES = ("maps --footprints", "simulate", "localize", "segment", "odometry", "import", "export", "evaluate")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_disk_that_fills_up_is_one_line(
+    name: str,
+    tmp_path: Path,
+    arena: Arena,
+    request: pytest.FixtureRequest,
+    seed: int,
+    kills: int,
+    tally: Callable[..., None],
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    (tmp_path / "tmp").mkdir()
+    place = disk / "place"
+    place.mkdir()
+    job = JOBS[name](place, request)
+    start(job, place)
+    assert arena.run("brmgeo", *job.words).kind == "accepted"
+    whole = digests(job.out)
+    needed = sum(p.stat().st_size for p in place.rglob("*") if p.is_file())
+    inputs = sum(p.stat().st_size for p in place.rglob("*") if p.is_file() and job.out not in p.parents)
+    first = sum(p.stat().st_size for p in job.first.rglob("*") if p.is_file()) if job.first else 0
+    shutil.rmtree(job.out)
+    for path in place.glob(".brmgeo*"):
+        shutil.rmtree(path, ignore_errors=True)
+    sources = Path(shutil.copytree(place, tmp_path / "sources"))
+    rng = np.random.default_rng([seed, 4, zlib.crc32(name.encode())])
+    counts: Counter[str] = Counter()
+    faults = []
+    for _ in range(2 * kills):
+        low = inputs + first + (len(list(sources.rglob("*"))) + 40) * 4096
+        size = low + int(rng.uniform(0.0, 1.0) * max(needed - inputs - first, 64 << 10))
+        done = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(disk)], capture_output=True, text=True
+        )
+        if done.returncode != 0:
+            pytest.skip(f"no small disk: {done.stderr.strip()} (it takes root)")
+        try:
+            shutil.copytree(sources, place)
+            start(job, place)
+            before = digests(job.out) if job.out.is_dir() else {}
+            outcome = arena.run("brmgeo", *job.words)
+            wrong = [f"{outcome.kind}: {outcome.said[-300:]}"] if outcome.kind in FAULTS else []
+            if outcome.kind == "refused" and str(disk) not in outcome.said:
+                wrong.append(f"the place is not named: {outcome.said[-300:]}")
+            now = digests(job.out) if job.out.is_dir() else {}
+            half = [n for n, v in now.items() if n.endswith((".tif", ".csv", ".gpkg", ".tum", ".png", ".toml"))
+                    and outcome.kind == "refused" and n in whole and v not in (whole[n], before.get(n))]  # fmt: skip
+            # A GeoPackage says when it was written.
+            wrong += [f"{n} is half-written" for n in half if not n.endswith(".gpkg")]
+            wrong += [f"{n} is gone" for n in before if n not in now]
+        finally:
+            subprocess.run(["umount", "-l", str(disk)], check=True)
+        counts["tried"] += 1
+        counts[outcome.kind] += 1
+        counts["untidy"] += any("not named" in w for w in wrong)
+        counts["lost"] += any("half-written" in w or "gone" in w for w in wrong)
+        faults += [f"{size} bytes: {w}" for w in wrong]
+    tally("full disk", name, **counts)
+    assert not faults, "\n".join([f"STRESS_SEED={seed}", *faults])
