@@ -1,4 +1,4 @@
-"""Commands killed at random moments: nothing half-written, nothing of the user's lost, and the next run ends as if it had not been.
+"""Commands killed at random moments: nothing is half-written or lost, and the next run ends as if nothing had been.
 
 What two undisturbed runs write alike must be the same after a kill and a second run. SIGTERM also cleans up at once.
 """
@@ -33,7 +33,7 @@ END_S = 30.0
 
 @dataclass(frozen=True)
 class Job:
-    """A command whose results are ``out``; ``first`` is what stands there before it runs, ``again`` whether it may replace."""
+    """A command whose results are ``out``; ``first`` stands there before it runs, ``again``: whether it may replace."""
 
     words: Sequence[object]
     out: Path
@@ -195,9 +195,7 @@ def digests(out: Path) -> dict[str, str]:
 
 def litter(folder: Path) -> list[str]:
     """Scratch of ours in a job's folder, and anything in its temporary one."""
-    found = [p for p in folder.rglob(".brmgeo-part-*")]
-    found += [p for p in (folder / "tmp").iterdir()]
-    found += [p for p in folder.glob("data/work/tmp/*")]
+    found = [*folder.rglob(".brmgeo-part-*"), *(folder / "tmp").iterdir(), *folder.glob("data/work/tmp/*")]
     return sorted({str(p.relative_to(folder)) for p in found})
 
 
