@@ -51,7 +51,7 @@ def seed() -> int:
 @pytest.fixture(scope="session")
 def size() -> int:
     """Damaged files a format."""
-    return int(os.environ.get("STRESS_N", "30"))
+    return int(os.environ.get("STRESS_N", "25"))
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from formats import FORMATS, seed_of
 
 COUNTED = [
     name for name in FORMATS
-    if name.startswith(("ULog", "Ardu", "MAV", "ROS", "video", "geotagged", "odometry", "Geo", "shape", "Flat", "DXF"))
+    if name.startswith(("ULog", "Ardu", "MAV", "ROS", "video", "geotagged", "odometry,", "Geo", "shape", "Flat", "DXF"))
     and not name.startswith("GeoTIFF")
 ]  # fmt: skip
 
