@@ -18,6 +18,14 @@ from kills import JOBS, digests, start
 NAMES = ("maps --footprints", "simulate", "localize", "segment", "odometry", "import", "export", "evaluate")
 
 
+PAGE = 4096
+
+
+def bytes_of(folder: Path) -> int:
+    """What the files below a folder take of a disk in memory."""
+    return sum(-(-p.stat().st_size // PAGE) * PAGE for p in folder.rglob("*") if p.is_file())
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_disk_that_fills_up_is_one_line(
     name: str,
@@ -37,19 +45,18 @@ def test_a_disk_that_fills_up_is_one_line(
     start(job, place)
     assert arena.run("brmgeo", *job.words).kind == "accepted"
     whole = digests(job.out)
-    needed = sum(p.stat().st_size for p in place.rglob("*") if p.is_file())
-    inputs = sum(p.stat().st_size for p in place.rglob("*") if p.is_file() and job.out not in p.parents)
-    first = sum(p.stat().st_size for p in job.first.rglob("*") if p.is_file()) if job.first else 0
+    high = bytes_of(place)
     shutil.rmtree(job.out)
     for path in place.glob(".brmgeo*"):
         shutil.rmtree(path, ignore_errors=True)
     sources = Path(shutil.copytree(place, tmp_path / "sources"))
+    start(job, place)
+    low = bytes_of(place) + PAGE
     rng = np.random.default_rng([seed, 4, zlib.crc32(name.encode())])
     counts: Counter[str] = Counter()
     faults = []
     for _ in range(2 * kills):
-        low = inputs + first + (len(list(sources.rglob("*"))) + 40) * 4096
-        size = low + int(rng.uniform(0.0, 1.0) * max(needed - inputs - first, 64 << 10))
+        size = low + int(rng.uniform(0.0, 1.0) * max(high - low, 8 * PAGE)) // PAGE * PAGE
         done = subprocess.run(
             ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(disk)], capture_output=True, text=True
         )
