@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
+import re
 import select
 import signal
 import subprocess
@@ -14,15 +16,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 ROOT = Path(__file__).resolve().parents[2]
 HANG_S = 30.0
+BUSY_S = 120.0  # where others have the processor
 MEMORY_BYTES = 3 << 30  # of a case on inputs of some kilobytes
 FAULTS = ("untidy", "traceback", "hang", "memory", "crash")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a case ended: accepted, refused, or one of FAULTS; what it said; seconds; bytes of memory at most."""
+    """How a case ended: accepted, refused, long (stopped while it told how long it takes), or one of FAULTS.
+
+    With what it said, its seconds, and its bytes of memory at most.
+    """
 
     kind: str
     said: str = ""
@@ -70,6 +78,13 @@ class Arena:
             start_new_session=True,
         )
 
+    def _worked_s(self) -> float:
+        """Seconds of processor that the process has had."""
+        with contextlib.suppress(psutil.Error):
+            times = psutil.Process(self._process.pid if self._process else None).cpu_times()
+            return float(times.user + times.system)
+        return math.inf
+
     def run(self, call: str, *words: object, within_s: float = HANG_S) -> Outcome:
         """Runs one of ``contestant.CALLS`` with these words."""
         if self._process is None or self._process.poll() is not None:
@@ -81,11 +96,18 @@ class Arena:
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([call, *map(str, words)]) + "\n")
         self._process.stdin.flush()
-        ready, _, _ = select.select([self._process.stdout], [], [], within_s)
+        worked = self._worked_s()
+        ready: list[object] = []
+        while not ready and (seconds := time.monotonic() - begun) < max(within_s, BUSY_S):
+            if seconds > within_s and self._worked_s() - worked > within_s:
+                break
+            ready, _, _ = select.select([self._process.stdout], [], [], 1.0)
         seconds = time.monotonic() - begun
         if not ready:
+            said = (self.scratch / f"said-{self._process.pid}").read_text(errors="replace")
             self._end()
-            return Outcome("hang", f"no end within {within_s:.0f} s", seconds)
+            kind = "long" if re.search(r"\d of \d.* left$", said, re.MULTILINE) else "hang"
+            return Outcome(kind, f"{said}\nno end within {seconds:.0f} s", seconds)
         line = self._process.stdout.readline()
         if not line:
             code = self._end()

@@ -190,4 +190,4 @@ def test_bombs_are_told_or_done_in_bounds(
     tally("bombs", name, tried=1, **{outcome.kind: 1})
     told = f"{outcome.kind} after {outcome.seconds:.1f} s, {outcome.peak / 2**30:.1f} GiB: {outcome.said[-2000:]}"
     print(told)
-    assert outcome.kind not in FAULTS, told
+    assert outcome.kind not in (*FAULTS, "long"), told

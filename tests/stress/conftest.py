@@ -24,7 +24,19 @@ for room in ("flight", "pipelines", "workflow", "stress"):
     sys.path.insert(0, str(TESTS / room))
 from arena import Arena  # noqa: E402
 
-COLUMNS = ("tried", "accepted", "refused", "untidy", "traceback", "hang", "memory", "crash", "lost", "unseen")
+COLUMNS = (
+    "tried",
+    "accepted",
+    "refused",
+    "untidy",
+    "traceback",
+    "long",
+    "hang",
+    "memory",
+    "crash",
+    "lost",
+    "unseen",
+)
 
 
 def pytest_configure(config: pytest.Config) -> None:
