@@ -70,7 +70,7 @@ class Digests:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
         signatures[path] = look
         entry = self._known.get(path)
-        if entry is not None and tuple(entry[1:]) == look:
+        if isinstance(entry, list) and tuple(entry[1:]) == look:
             return str(entry[0])
         digest = files.digest(Path(path))
         if signature(path) != look:

@@ -35,9 +35,10 @@ from brmgeo import files
 from brmgeo.errors import WorkflowError
 from brmgeo.workflow.digests import Digests, Signature, signature
 from brmgeo.workflow.disk import disk_errors, is_full
-from brmgeo.workflow.stage import Json, Map, S, Stage, key_of, plain
+from brmgeo.workflow.stage import Json, Map, S, Stage, canonical, key_of, plain
 
 RECORD = "provenance.json"
+_ORIGIN = {"stage", "version", "settings", "inputs", "key"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +223,7 @@ class Store:
 
     def _record(self, step: Step[Any]) -> Json | None:
         record = files.read_json(step.path / RECORD)
-        return record if isinstance(record, dict) and record.get("key") == step.key else None
+        return record if _is_whole(record) and record["key"] == step.key else None
 
     def _damage(self, step: Step[Any], record: Json) -> str | None:
         for name, entry in record["outputs"].items():
@@ -251,7 +252,7 @@ class Store:
         # GDAL can lose the last blocks on a full disk without an exception: no room at all is reason enough.
         if is_full(self.root):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out))
-        return step.origin | {
+        record: Json = step.origin | {
             "label": step.label,
             "outputs": outputs,
             "facts": facts,
@@ -261,6 +262,7 @@ class Store:
             "seconds": round(time.time() - start, 3),
             "host": socket.gethostname(),
         }
+        return record | {"digest": _digest(record)}
 
     def _publish(self, step: Step[Any], work: Path) -> None:
         step.path.parent.mkdir(parents=True, exist_ok=True)
@@ -356,7 +358,10 @@ class Store:
     def latest(self, region: str, label: str) -> Json | None:
         """The origin (stage, version, settings, inputs, key) last built for a step of a region, or None."""
         record = files.read_json(self._latest_path(region, label))
-        return record if isinstance(record, dict) and "inputs" in record else None
+        if not isinstance(record, dict) or not record.keys() >= _ORIGIN:
+            return None
+        fields = (record["settings"], record["inputs"], *_values(record["inputs"]))
+        return record if all(isinstance(f, dict) for f in fields) else None
 
     def remember(self, region: str, step: Step[Any]) -> None:
         """Notes a built step as the most recent of its label in a region."""
@@ -378,6 +383,26 @@ def _require_frozen(settings: object, label: str) -> None:
         raise TypeError(f"settings of stage {label}: {type(settings).__name__} is no frozen dataclass")
 
 
+def _values(field: Json) -> list[Json]:
+    return list(field.values()) if isinstance(field, dict) else []
+
+
+def _is_whole(record: Json) -> bool:
+    """Whether a record is as it was written: by its digest, or, in stores of older versions, by its fields."""
+    if not isinstance(record, dict):
+        return False
+    if "digest" not in record:
+        return _ORIGIN | {"outputs", "facts", "end"} <= record.keys()
+    try:
+        return bool(record["digest"] == _digest({n: v for n, v in record.items() if n != "digest"}))
+    except ValueError:  # numbers and letters that no record has
+        return False
+
+
+def _digest(record: Json) -> str:
+    return files.digest_of(canonical(record).encode(errors="surrogateescape"))
+
+
 def _is_held(lock: Path) -> bool:
     """True where the owner of a work folder lives; nobody owns one that has no lock yet, since making both is one act."""
     try:
@@ -392,7 +417,7 @@ def _is_held(lock: Path) -> bool:
 
 def _holder(path: Path) -> str:
     held = files.read_json(path)
-    if not isinstance(held, dict) or "pid" not in held:
+    if not isinstance(held, dict) or not {"pid", "host", "since"} <= held.keys():
         return "another run"
     return f"process {held['pid']} on {held['host']} since {held['since']}"
 

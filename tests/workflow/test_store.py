@@ -363,6 +363,48 @@ def test_damaged_artifact_is_made_again(store: Store, source: Path, harm: str) -
     assert (again.path / "words.txt").read_text() == "A BRIDGE OVER THE RIVER\n"
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ('"outputs"', '"outpuus"'),
+        ('"words": 5', '"words": 4'),
+        ('"words": 5', '"words": NaN'),
+        ('"words": 5', '"words": "\\ud800"'),
+    ],
+)
+def test_a_record_that_is_not_as_it_was_written_is_damage(
+    store: Store, source: Path, right: str, wrong: str
+) -> None:
+    made = words(store, source)
+    text = (made.path / RECORD).read_text()
+    assert right in text
+    (made.path / RECORD).write_text(text.replace(right, wrong, 1))
+    assert store.damage(made.step) == f"{RECORD} is unreadable"
+    assert words(store, source).facts == {"words": 5}
+
+
+def test_records_of_older_versions_have_no_digest(store: Store, source: Path) -> None:
+    made = words(store, source)
+    record = json.loads((made.path / RECORD).read_text())
+    del record["digest"]
+    (made.path / RECORD).write_text(json.dumps(record))
+    assert not words(store, source).fresh
+    del record["facts"]
+    (made.path / RECORD).write_text(json.dumps(record))
+    assert words(store, source).fresh
+
+
+@pytest.mark.parametrize("text", ['{"inputs": {}}', '{"inputs": [], "settings": 1}', "[]"])
+def test_a_damaged_note_of_what_was_built_last_is_none(store: Store, source: Path, text: str) -> None:
+    made = words(store, source)
+    store.remember("here", made.step)
+    (note,) = (store.root / "latest").rglob("*.json")
+    note.write_text(text)
+    assert store.latest("here", made.step.label) is None
+    store.remember("here", made.step)
+    assert store.latest("here", made.step.label) == made.step.origin
+
+
 def test_verify_sees_a_flipped_bit_and_a_stray_file(store: Store, source: Path) -> None:
     made = words(store, source)
     assert store.verify(made) == []
