@@ -116,9 +116,9 @@ def tally() -> Tally:
 def rows() -> Iterator[dict[str, str | int]]:
     path = out() / "rows.jsonl"
     if path.is_file():
-        yield from sorted(
-            (json.loads(line) for line in path.read_text().splitlines()), key=lambda r: (r["part"], r["name"])
-        )
+        # What was run again counts once.
+        found = {(r["part"], r["name"]): r for r in map(json.loads, path.read_text().splitlines())}
+        yield from (found[key] for key in sorted(found))
 
 
 def table() -> str:

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-import uuid
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -132,10 +131,9 @@ JOBS: dict[str, Make] = {
 
 
 class Run:
-    """One process of the command, with a temporary folder and a mark of its own."""
+    """One process of the command, with a temporary folder and a session of its own."""
 
     def __init__(self, job: Job, folder: Path) -> None:
-        self.mark = uuid.uuid4().hex
         self.temporary = folder / "tmp"
         self.temporary.mkdir(exist_ok=True)
         self.said = folder / "said.txt"
@@ -143,7 +141,6 @@ class Run:
             "SCHEDULER": job.scheduler,
             "TMPDIR": str(self.temporary),
             "PYTHONPATH": str(ROOT),
-            "BRMGEO_STRESS": self.mark,
         }
         with open(self.said, "wb") as file:
             self.process = subprocess.Popen(
@@ -155,11 +152,8 @@ class Run:
         """All that still run and come of this run."""
         found = []
         for process in psutil.process_iter():
-            with contextlib.suppress(psutil.Error):
-                if (
-                    process.environ().get("BRMGEO_STRESS") == self.mark
-                    and process.status() != psutil.STATUS_ZOMBIE
-                ):
+            with contextlib.suppress(psutil.Error, OSError):
+                if os.getsid(process.pid) == self.process.pid and process.status() != psutil.STATUS_ZOMBIE:
                     found.append(process)
         return found
 
