@@ -107,7 +107,10 @@ def simulate_flight(what: Simulation, seed: int, out: Path, name: str) -> Path:
     native = what.native if what.imagery is None else None
     imagery = None if file is None else imagery_along(route, settings, file, native)
     place = out.absolute().parent
-    with disk_errors(f"simulate {name}", place), whole_folder(out, say=Progress().say, ours=lambda _: True) as scratch:
+    with (
+        disk_errors(f"simulate {name}", place),
+        whole_folder(out, say=Progress().say, ours=lambda _: True) as scratch,
+    ):
         simulate(scratch, ground, route, maps.crs, settings, seed, mode=what.mode, imagery=imagery, name=name)
     return out
 

@@ -8,8 +8,8 @@ import os
 import stat
 import subprocess
 import sys
-from contextlib import AbstractContextManager
 import tempfile
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
