@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, JSON, what a disk says in words, digests, locks, and where caches go."""
+"""Files and folders that appear whole or not at all, JSON, what a disk says in words, digests, locks, the place of caches."""
 
 from __future__ import annotations
 
