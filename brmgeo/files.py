@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, JSON, what a disk says in words, digests, locks, the place of caches."""
+"""Files and folders that appear whole or not at all, JSON, what a disk says in words, digests, locks, where caches go."""
 
 from __future__ import annotations
 
