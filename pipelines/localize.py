@@ -13,6 +13,7 @@ from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import NetworkUse, frame_masks
 from brmgeo.match import METHODS
 from brmgeo.region import FlightSettings
+from brmgeo.workflow.disk import disk_errors
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import serial_map
 
@@ -94,7 +95,10 @@ def localize(
             sift=sift,
             attribution=attribution,
         )
-        with whole_folder(out, say=progress.say, ours=is_result) as scratch:
+        with (
+            whole_folder(out, say=progress.say, ours=is_result) as scratch,
+            disk_errors(f"localize {flight.name}", out.absolute().parent),
+        ):
             write_results(scratch, out, results)
     report = out / "report.html"
     progress.say(f"{flight.name} by {method}: {results.sentence}; report: {report}")

@@ -15,6 +15,7 @@ from brmgeo.flight.logs.parts import imported, is_of_camera
 from brmgeo.flight.logs.pictures import Pictures, pictures_of
 from brmgeo.flight.logs.values import ImportSettings, Log, LogOptions
 from brmgeo.flight.write import rounded, write_flight
+from brmgeo.workflow.disk import disk_errors
 
 
 def import_log(path: Path, out: Path, settings: ImportSettings | None = None) -> list[str]:
@@ -36,7 +37,7 @@ def import_log(path: Path, out: Path, settings: ImportSettings | None = None) ->
     if log.faults and pictures is None:
         raise FlightError(f"{path}: {log.faults[0]}")
     flight = imported(path, log, pictures, settings)
-    with files.whole_folder(out) as work:
+    with files.whole_folder(out) as work, disk_errors(f"import {path}", out.absolute().parent):
         if pictures is not None:
             _write_pictures(work, pictures, flight.pictures)
         write_flight(work, rounded(flight.parts))

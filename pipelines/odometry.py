@@ -14,6 +14,7 @@ from brmgeo.files import whole_folder
 from brmgeo.flight.folder import MADE_BY, is_own_odometry, read_flight
 from brmgeo.flight.own import OdometryMethod, estimate, thinned_rows
 from brmgeo.flight.write import copy_thinned, name_track, rounded_track, write_facts, write_track
+from brmgeo.workflow.disk import disk_errors
 
 
 def method_named(name: str) -> OdometryMethod:
@@ -60,7 +61,7 @@ def thin_flight(flight_dir: Path, out: Path, every_s: float) -> Path:
     flight = read_flight(flight_dir)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: the thinned flight needs a new or empty folder")
-    with whole_folder(out) as work:
+    with whole_folder(out) as work, disk_errors(f"odometry --thin {out}", out.absolute().parent):
         copy_thinned(flight, [int(i) for i in thinned_rows(flight.times_s, every_s)], work)
         read_flight(work)
     return out

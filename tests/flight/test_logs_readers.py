@@ -313,3 +313,15 @@ def test_a_missing_library_names_the_pip_command(
         MissingExtraError, match=rf"needs {library}, which is not installed: pip install 'brmgeo\[logs\]'"
     ):
         read_log(tmp_path / name)
+
+
+@pytest.mark.parametrize("wrong", ["1,5", "²", "=cmd", "9" * 5000])
+def test_a_row_of_a_text_log_that_is_no_number_is_left_out(tmp_path: Path, wrong: str) -> None:
+    path = as_text(dataflash(tmp_path / "a.bin"))
+    rows = path.read_text().splitlines()
+    k = [i for i, row in enumerate(rows) if row.startswith("IMU, ")][9]
+    rows[k] = ", ".join([*rows[k].split(", ")[:3], wrong, *rows[k].split(", ")[4:]])
+    path.write_text("\n".join(rows))
+    imu = read_log(path).imu
+    assert imu is not None
+    assert len(imu.t_s) in (399, 400)  # a comma splits it into two numbers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
 from collections.abc import Callable
@@ -11,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pyogrio
 import pytest
+import shapely
 from pyproj import Transformer
 
-from brmgeo.errors import BrmgeoError, CrsError, MissingInputError, SettingsError
+from brmgeo.errors import BrmgeoError, CrsError, InputError, MissingInputError, SettingsError, WorkflowError
 from brmgeo.export.candidates import write_candidates
 from brmgeo.export.trajectory import TimedPath, write_trajectory
 from brmgeo.flight.values import Estimate
@@ -95,6 +97,48 @@ def test_what_cannot_be_written_is_refused(
         export_results(results, what, tmp_path / name, crs)
     assert (results / "trajectory.gpkg").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["results"]
+
+
+@pytest.mark.parametrize(
+    ("what", "damage"),
+    [*itertools.product(["candidates", "online"], ["cut", "noise", "no points"]), ("candidates", "no UTF-8")],
+)
+def test_damaged_results_are_one_line(results: Path, tmp_path: Path, what: str, damage: str) -> None:
+    path = results / ("candidates.geojson" if what == "candidates" else "trajectory.gpkg")
+    whole = path.read_bytes()
+    if damage == "no points":
+        frame = pyogrio.read_dataframe(path, layer=what)
+        frame.geometry = [shapely.box(*p.bounds[:2], 200.0, 60.0) for p in frame.geometry]
+        path.unlink()
+        pyogrio.write_dataframe(frame, path, layer=what)
+    else:
+        size = len(whole) // 2
+        harm = {
+            "cut": b"",
+            "noise": bytes(range(256)) * 8,
+            "no UTF-8": whole[size:].replace(b"converged", b"conv\xffrged"),
+        }
+        path.write_bytes(whole[:size] + harm[damage])
+    with pytest.raises(InputError, match=re.escape(f"{path}: ")) as told:
+        export_results(results, what, tmp_path / "a.csv", None)
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "a.csv").exists()
+
+
+@pytest.mark.parametrize("free", [0, 1, 3, 12])
+@pytest.mark.parametrize("name", ["a.gpkg", "a.geojson", "a.csv"])
+def test_a_full_disk_under_an_export_is_told_with_its_place(
+    results: Path, small_disk: Path, name: str, free: int
+) -> None:
+    (small_disk / "fill").write_bytes(bytes((1 << 20) - 4096 * free))
+    if free and name != "a.gpkg":
+        export_results(results, "candidates", small_disk / name, None)
+        return
+    with pytest.raises(
+        WorkflowError, match=f"{small_disk / name}.*(the disk is full|check space and rights)"
+    ):
+        export_results(results, "candidates", small_disk / name, None)
+    assert [p.name for p in small_disk.iterdir()] == ["fill"]
 
 
 def test_the_command_refuses_a_folder_that_is_no_result(

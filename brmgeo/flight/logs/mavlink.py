@@ -44,14 +44,15 @@ _TELEMETRY = (
 def rows_of(messages: list[Any], get: Callable[[Any], list[float]], needed: int | None = None) -> FloatArray:
     """(n, k) rows whose first column, the time, grows and whose first ``needed`` are numbers.
 
-    A message that lacks a field is of another version, or damaged, and left out. Of no row at all, (0, 0).
+    A message that lacks a field, or has no number in it, is of another version, or damaged, and left out. Of no row at all,
+    (0, 0).
     """
     out: list[list[float]] = []
     last = -np.inf
     for message in messages:
         try:
             row = get(message)
-        except AttributeError:
+        except (AttributeError, ValueError):
             continue
         if row[0] > last and all(np.isfinite(v) for v in row[:needed]):
             out.append(row)
