@@ -11,7 +11,7 @@ from typing import Any
 import pyogrio
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError, WorkflowError, one_line
-from brmgeo.files import whole_file
+from brmgeo.files import clear_scratch, whole_file
 from brmgeo.geo.crs import LONLAT, parse_crs
 from brmgeo.geo.formats import vector_file
 from brmgeo.workflow.disk import disk_errors
@@ -61,6 +61,7 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
     digits = 8 if frame.crs.is_geographic else 4
     for name, values in zip(names, (frame.geometry.x, frame.geometry.y), strict=True):
         frame[name] = values.round(digits)
+    clear_scratch(out.absolute().parent)
     with whole_file(out) as scratch, disk_errors(f"export --out {out}", out.absolute().parent):
         if driver == "CSV":
             columns = [*names, *(c for c in frame.columns if c not in (*names, "geometry"))]

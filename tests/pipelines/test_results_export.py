@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from pyproj import Transformer
 from brmgeo.errors import BrmgeoError, CrsError, InputError, MissingInputError, SettingsError, WorkflowError
 from brmgeo.export.candidates import write_candidates
 from brmgeo.export.trajectory import TimedPath, write_trajectory
+from brmgeo.files import SCRATCH
 from brmgeo.flight.values import Estimate
 from pipelines.cli import cli, run
 from pipelines.results import export_results
@@ -139,6 +141,15 @@ def test_a_full_disk_under_an_export_is_told_with_its_place(
     ):
         export_results(results, "candidates", small_disk / name, None)
     assert [p.name for p in small_disk.iterdir()] == ["fill"]
+
+
+def test_what_a_killed_export_left_goes_with_a_later_one(results: Path, tmp_path: Path) -> None:
+    left = [tmp_path / f"{SCRATCH}0123456789ab.gpkg{end}" for end in ("", "-journal")]
+    for path in left:
+        path.write_text("half")
+        os.utime(path, (1e9, 1e9))
+    export_results(results, "online", tmp_path / "a.csv", None)
+    assert not any(path.exists() for path in left)
 
 
 def test_the_command_refuses_a_folder_that_is_no_result(
