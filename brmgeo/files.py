@@ -82,6 +82,10 @@ def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
         if durable:
             sync(scratch)
         os.replace(scratch, path)
+    except OSError as error:
+        # A write that the disk does not take knows no name.
+        error.filename = error.filename or os.fspath(path)
+        raise
     finally:
         scratch.unlink(missing_ok=True)
 

@@ -75,9 +75,9 @@ def _write(frame: Any, scratch: Path, out: Path, layer: str, driver: str) -> Non
     # GDAL does not tell of every write that a full disk did not take.
     try:
         pyogrio.write_dataframe(frame, scratch, layer=layer, driver=driver)
-        written = pyogrio.read_info(scratch, layer=layer, force_feature_count=True)["features"]
+        written = pyogrio.read_info(vector_file(scratch), layer=layer, force_feature_count=True)["features"]
         reason = f"{written} of {len(frame)} points came through" if written != len(frame) else ""
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, InputError) as error:
         reason = one_line(error, 120)
     if reason:
         raise WorkflowError(f"{out}: cannot be written ({reason}): check space and rights")

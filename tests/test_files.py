@@ -413,3 +413,10 @@ def test_files_that_are_replaced_are_set_aside_where_they_are_not_ours(tmp_path:
     assert (tmp_path / "a.txt").read_text() == "third"
     assert (tmp_path / "a.edited.txt").read_text() == "edited"
     assert len(told) == 1
+
+
+def test_a_write_that_the_disk_does_not_take_is_told_with_its_file(small_disk: Path) -> None:
+    with pytest.raises(OSError) as told:
+        files.write_bytes(small_disk / "a.png", bytes(2 << 20))
+    assert told.value.filename == str(small_disk / "a.png")
+    assert list(small_disk.iterdir()) == []
