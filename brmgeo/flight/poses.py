@@ -5,6 +5,7 @@ What comes out is the pose of the body (FLU) in a gravity-aligned frame, z up; s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from brmgeo.flight.tables import check_increasing, number, read_rows, read_table
 UNIT_TOLERANCE = 0.01
 #: Rows that repeat a time are one pose told again when they lie no farther apart than this.
 REPEAT_M = 0.5
+#: A whole number as logs write it: isdigit takes "²" too, and int() refuses thousands of digits.
+WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,16 +79,20 @@ def _finish(
     return Odometry(t, xyz, wxyz / length[:, None], path.name)
 
 
-def _seconds(path: Path, line: int, text: str, nanoseconds: bool | None) -> float:
-    # None: whole numbers are nanoseconds, as VINS writes them, unless so small that they are seconds; forks write seconds.
-    text = text.strip()
-    whole = text.lstrip("+-").isdigit()
-    if nanoseconds and not whole:
-        raise refuse(path, line, 1, f"time {text[:40]!r} is not a whole number of nanoseconds")
-    if whole and (nanoseconds or (nanoseconds is None and abs(int(text)) >= 1e11)):
-        return int(text) / 1e9
-    seconds = number(path, line, 1, text)
-    return seconds / 1e9 if nanoseconds is None and abs(seconds) >= 1e17 else seconds
+def _seconds(path: Path, lines: list[int], texts: list[str], nanoseconds: bool | None) -> FloatArray:
+    # None: VINS writes whole nanoseconds, forks write seconds. One unit for the whole file, told by its largest time.
+    texts = [text.strip() for text in texts]
+    whole = [WHOLE.fullmatch(text) is not None for text in texts]
+    if nanoseconds and not all(whole):
+        i = whole.index(False)
+        raise refuse(path, lines[i], 1, f"time {texts[i][:40]!r} is not a whole number of nanoseconds")
+    values = np.array([number(path, line, 1, text) for line, text in zip(lines, texts)])
+    if nanoseconds is None:
+        largest = float(np.abs(values).max())
+        nanoseconds = largest >= 1e17 or (all(whole) and largest >= 1e11)
+    if not nanoseconds:
+        return values
+    return np.array([int(t) / 1e9 if w else v / 1e9 for t, w, v in zip(texts, whole, values.tolist())])
 
 
 def _text_reader(
@@ -101,10 +108,9 @@ def _text_reader(
             rows = (line for line in read_text(path).splitlines() if line.strip() and line.strip()[0] != "#")
             between = "," if "," in next(rows, ",") else None
         cells, lines = read_rows(path, between, widths)
-        t = np.empty(len(cells))
+        t = _seconds(path, lines, [row[0] for row in cells], nanoseconds)
         values = np.empty((len(cells), 7))
         for i, (row, line) in enumerate(zip(cells, lines)):
-            t[i] = _seconds(path, line, row[0], nanoseconds)
             for k in range(7):
                 values[i, k] = number(path, line, k + 2, row[k + 1])
         wxyz = values[:, 3:]

@@ -76,8 +76,8 @@ def number(path: Path, line: int, column: str | int, text: str) -> float:
     if not text:
         raise refuse(path, line, column, "the value is missing: fill it in or leave the whole column out")
     try:
-        # float() takes "1_000", which no log writes on purpose.
-        value = float(text) if "_" not in text else math.nan
+        # float() takes "1_000" and digits of other scripts, which no log writes on purpose.
+        value = float(text) if "_" not in text and text.isascii() else math.nan
     except ValueError:
         raise refuse(path, line, column, f"{text[:40]!r} is not a number") from None
     if not math.isfinite(value):

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from brmgeo.errors import FlightError
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
+from brmgeo.flight.poses import read_poses
 from brmgeo.flight.readings import Attitude
 
 LOGS = Path(os.environ.get("BRMGEO_REAL_DATA", Path(__file__).parents[2] / "../shared/data")) / "logs"
@@ -187,3 +188,21 @@ def test_real_logs() -> None:
         read_odometry(LOGS / "wj762_vinsfusion_vio_loop.csv", "tum")
     assert len(read_odometry(LOGS / "V102.txt", "tum").t_s) == 803
     assert math.isclose(np.linalg.norm(vins.wxyz[7]), 1.0)
+
+
+@pytest.mark.parametrize("time", ["²", "9" * 5000, "١٢٣", "1_000"])
+@pytest.mark.parametrize("form", ["euroc", "vins-mono", "tum"])
+def test_a_time_that_is_no_plain_number_is_one_line(tmp_path: Path, form: str, time: str) -> None:
+    path = tmp_path / "odometry.txt"
+    between = " " if form == "tum" else ","
+    path.write_text("\n".join(between.join([t, *"0001000"[:7]]) for t in ("100000000000", time)))
+    with pytest.raises(FlightError, match=":2: column 1: "):
+        read_poses(path, form)
+
+
+def test_the_times_of_a_file_have_one_unit(tmp_path: Path) -> None:
+    path = tmp_path / "vins.csv"
+    path.write_text(
+        "".join(f"{t},0,0,0,1,0,0,0,\n" for t in (0, 50_000_000_000, 100_000_000_000, 150_000_000_000))
+    )
+    assert read_poses(path, "vins-mono").t_s.tolist() == [0.0, 50.0, 100.0, 150.0]

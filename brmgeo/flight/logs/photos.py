@@ -213,7 +213,7 @@ def _time(detail: dict[int, Any], main: dict[int, Any]) -> float:
     except ValueError:
         return math.nan
     fraction = str(detail.get(37521) or detail.get(37520) or "").replace("\x00", "").strip()
-    return moment.timestamp() + (float("0." + fraction) if fraction.isdigit() else 0.0)
+    return moment.timestamp() + (float("0." + fraction) if fraction.isdecimal() else 0.0)
 
 
 def _place(photo: _Photo, gps: dict[int, Any]) -> None:
