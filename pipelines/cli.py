@@ -1001,6 +1001,8 @@ def import_(
     for unit in units:
         if unit not in ("deg/s", "g", "mg"):
             raise SettingsError(f"import: --imu-units {unit!r} is unknown: known are deg/s, g, mg")
+    if camera is not None and fov_deg is not None:
+        raise SettingsError("import: --camera and --fov both tell the focal length: give one of them")
     if camera is not None and len(camera) not in (4, 9):
         raise SettingsError(
             f"import: --camera has {len(camera)} numbers: give fx,fy,cx,cy or these and k1,k2,p1,p2,k3"

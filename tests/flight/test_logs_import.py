@@ -195,6 +195,8 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     assert "is there already" in command("import", order, "--out", tmp_path / "n")[1]
     assert "--imu-units 'furlong' is unknown" in refused(tmp_path / "i", order, "--imu-units", "furlong")
     assert "--camera has 3 numbers" in refused(tmp_path / "j", order, "--camera", "1,2,3")
+    both = "--camera", "100,100,50,50", "--fov", 43
+    assert "--camera and --fov both" in refused(tmp_path / "both", order, *both)
     images = bag(tmp_path / "images", "mcap", topics=("odom", "image"))
     assert "tells no height" in refused(tmp_path / "k", images)
     assert "(--fov FLOAT)" in refused(tmp_path / "l", images, "--agl", 60)
