@@ -325,3 +325,13 @@ def test_a_row_of_a_text_log_that_is_no_number_is_left_out(tmp_path: Path, wrong
     imu = read_log(path).imu
     assert imu is not None
     assert len(imu.t_s) in (399, 400)  # a comma splits it into two numbers
+def test_a_wrong_length_in_a_ulog_costs_the_messages_beside_it_and_is_told() -> None:
+    from brmgeo.flight.logs.ulog import _whole_messages
+
+    message = b"\x04\x00D\x01\x00ab"
+    data = bytearray(b"\0" * 16 + message * 50)
+    assert _whole_messages(bytes(data)) == (bytes(data), [])
+    data[16 + 20 * 7 + 1] ^= 0x80
+    whole, unread = _whole_messages(bytes(data))
+    assert unread == [(16 + 20 * 7, 16 + 21 * 7)]
+    assert whole == b"\0" * 16 + message * 49

@@ -37,6 +37,8 @@ from brmgeo.flight.readings import FloatArray, Imu, Odometry
 Data = dict[str, Any]
 #: In order of worth to a flight without GNSS: what vision said comes before what the autopilot made of everything.
 _STREAMS = ("vehicle_visual_odometry", "vehicle_odometry", "vehicle_local_position")
+_TYPES = b"BFIMPQALCDSOR"
+_HEADS = {_TYPES[i : i + 1] for i in range(len(_TYPES))}
 _DOWN = 25  # ROTATION_PITCH_270 of distance_sensor.orientation
 
 
@@ -52,12 +54,10 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
     if not path.is_file():
         raise MissingInputError(f"{path}: the log is missing")
     said = io.StringIO()
+    whole, unread = _whole_messages(path.read_bytes())
     try:
-        with (
-            contextlib.redirect_stdout(said),
-            path.open("rb") as file,
-        ):  # the library reports damage by printing
-            log = ULog(file)
+        with contextlib.redirect_stdout(said):  # the library reports damage by printing
+            log = ULog(io.BytesIO(whole))
     except Exception as error:  # damaged bytes make the library raise nearly anything
         reason = one_line(error, 120)
         raise FlightError(
@@ -71,6 +71,12 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
             f"{path}: the ULog breaks off before its first data: download it from the vehicle again"
         )
     notes: list[str] = []
+    if unread:
+        lost = sum(end - start for start, end in unread)
+        notes.append(
+            f"damaged at {len(unread)} places (first at byte {unread[0][0]}): {lost} of {len(whole) + lost} bytes "
+            "could not be read and were passed over"
+        )
     if log.file_corruption or "corrupt" in said.getvalue().lower() or _cut_short(path):
         notes.append("the file is damaged or cut short; what was whole in it was read")
 
@@ -127,6 +133,36 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
         notes=tuple(notes),
         faults=tuple(faults),
     )
+
+
+def _whole_messages(data: bytes) -> tuple[bytes, list[tuple[int, int]]]:
+    # The log without what does not lead from one message to the next, and the (start, end) of what was left out: one
+    # wrong length makes the library pass over all that follows. A way is found again where four messages follow each other.
+    def follows(at: int, count: int) -> bool:
+        for _ in range(count):
+            if at == len(data):
+                return True
+            if at + 3 > len(data) or data[at + 2] not in _TYPES:
+                return False
+            at += 3 + data[at] + 256 * data[at + 1]
+        return at <= len(data)
+
+    at, kept, unread = 16, 0, []
+    pieces = []
+    while at + 3 <= len(data):
+        end = at + 3 + data[at] + 256 * data[at + 1]
+        if data[at + 2] in _TYPES and (end == len(data) or data[end + 2 : end + 3] in _HEADS):
+            at = end
+            continue
+        again = next((q for q in range(at + 1, len(data) - 3) if follows(q, 4)), None)
+        if again is None:
+            break
+        if again != end:
+            pieces.append(data[kept:at])
+            unread.append((at, again))
+            kept = again
+        at = again
+    return b"".join([*pieces, data[kept:]]), unread
 
 
 def _cut_short(path: Path) -> bool:
