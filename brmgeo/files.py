@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from brmgeo.errors import SettingsError, WorkflowError
+from brmgeo.errors import BrmgeoError, SettingsError, WorkflowError
 
 if sys.platform == "win32":
     import msvcrt
@@ -33,6 +33,9 @@ _BESIDE_SQLITE = ("-wal", "-shm")
 Say = Callable[[str], object]
 # And those of folders that stand aside while another takes their place end with this.
 _OLD = ".old"
+_LEAST_FREE = 4096
+# What a disk does to what is being written.
+_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 _REASONS = {
     errno.ENOSPC: "the disk is full: free some space or choose another place",
@@ -66,6 +69,36 @@ def reason_of(number: int) -> str:
     return _REASONS[number]
 
 
+def is_full(place: Path, error: Exception | None = None) -> bool:
+    """True where the disk of ``place`` has no room for another block, or ``error`` says so; False where it does not say.
+
+    GDAL, SQLite and the like have exceptions of their own for a full disk.
+    """
+    if error is not None and ("No space left" in str(error) or "disk is full" in str(error)):
+        return True
+    try:
+        return shutil.disk_usage(place).free < _LEAST_FREE
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
+def _placed(place: Path, scratch: Path) -> Iterator[None]:
+    """Makes what a disk does to ``scratch`` an OSError that names ``place``, whichever library met it; others pass."""
+    try:
+        yield
+    except BrmgeoError:
+        raise
+    except Exception as error:
+        system = error if isinstance(error, OSError) else OSError()
+        named = system.filename2 or system.filename or scratch
+        if system.errno is None and is_full(place.parent, error):
+            system = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if system.errno in _WRITING and os.fsdecode(named).startswith(str(scratch)):
+            raise OSError(system.errno, system.strerror, str(place)) from error
+        raise
+
+
 # --- whole or not at all -----------------------------------------------------------------------------------------
 
 
@@ -78,14 +111,11 @@ def whole_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """
     scratch = path.with_name(f"{SCRATCH}{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
-        yield scratch
-        if durable:
-            sync(scratch)
-        os.replace(scratch, path)
-    except OSError as error:
-        # A write that the disk does not take knows no name.
-        error.filename = error.filename or os.fspath(path)
-        raise
+        with _placed(path, scratch):
+            yield scratch
+            if durable:
+                sync(scratch)
+            os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
 
@@ -166,19 +196,30 @@ def whole_files(folder: Path, names: Sequence[str], say: Say) -> Iterator[Path]:
     """An empty scratch folder in ``folder`` whose files of these names move there, in this order, when the block ends.
 
     After an error ``folder`` stays as it was. What a killed process left of its scratch folder goes first, so one process
-    at a time may write there. A file of such a name that is not ours, or was changed, is set aside (``set_aside``).
+    at a time may write there. Another file of such a name that is not ours, or was changed, is set aside (``set_aside``).
     """
     scratch = folder / f"{SCRATCH}files"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     try:
-        yield scratch
-        set_aside(folder, names, say)
-        for name in names:
-            os.replace(scratch / name, folder / name)
-        list_written(folder, names)
+        with _placed(folder, scratch):
+            yield scratch
+            set_aside(folder, [n for n in names if not _is_same(folder / n, scratch / n)], say)
+            for name in names:
+                os.replace(scratch / name, folder / name)
+            list_written(folder, names)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def write_listed(path: Path, data: bytes, say: Say) -> None:
+    """``whole_files`` for one file whose content is at hand."""
+    with whole_files(path.parent, [path.name], say) as made:
+        (made / path.name).write_bytes(data)
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    return one.is_file() and not one.is_symlink() and content_digest(one) == content_digest(other)
 
 
 @contextlib.contextmanager
@@ -202,9 +243,10 @@ def whole_folder(
     old = out.with_name(f"{scratch.name}{_OLD}")
     scratch.mkdir()
     try:
-        yield scratch
-        list_written(scratch, list(files_below(scratch)))
-        told = _carry(out, scratch, ours) if say is not None and out.is_dir() else []
+        with _placed(out, scratch):
+            yield scratch
+            list_written(scratch, list(files_below(scratch)))
+            told = _carry(out, scratch, ours) if say is not None and out.is_dir() else []
         if say is None and out.is_dir() and any(out.iterdir()):
             raise SettingsError(f"{out} is there by now, made by another run: choose another", needs="out")
         if out.exists():
@@ -414,6 +456,18 @@ def plain_name(text: str, otherwise: str) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in text).strip(".-") or otherwise
 
 
+def plain_cell(text: str) -> str:
+    """A text as a cell of a CSV that people open: one that a spreadsheet would take for a formula gets an apostrophe.
+
+    These begin with = + - @, a tab or a carriage return. An apostrophe before those is doubled, so taking one away gives the
+    text back.
+    """
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+
+
 # --- scratch in the temporary folder -----------------------------------------------------------------------------
 
 _HELD = ".brmgeo-scratch"
@@ -434,7 +488,8 @@ def scratch_folder(what: str) -> Iterator[Path]:
             break
         os.close(lock)
     try:
-        yield folder
+        with _placed(folder, folder):
+            yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         os.close(lock)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import itertools
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import pyogrio
+import pyogrio.errors
+import shapely
+from pyproj import CRS
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError, WorkflowError, one_line
-from brmgeo.files import clear_scratch, whole_file
+from brmgeo.errors import InputError, MissingInputError, SettingsError, one_line
+from brmgeo.files import plain_cell, write_bytes
 from brmgeo.geo.crs import LONLAT, parse_crs
 from brmgeo.geo.formats import vector_file
-from brmgeo.workflow.disk import disk_errors
+
+if TYPE_CHECKING:
+    import geopandas
 
 WHAT = ("online", "smoothed", "reference", "candidates")
 DRIVERS = {".gpkg": "GPKG", ".geojson": "GeoJSON", ".csv": "CSV"}
@@ -26,8 +30,10 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
     The suffix of ``out`` names the format: .gpkg, .geojson (always longitude and latitude) or .csv (columns x, y, or
     lon, lat for a geographic CRS). ``crs`` is that of the map where it is not given. Columns are those of the results.
 
+    Texts of a .csv are ``plain_cell``s.
+
     Raises MissingInputError where the results have no such path, InputError for damaged ones, SettingsError for an unknown
-    format or a CRS that GeoJSON cannot have, CrsError for an unknown one, WorkflowError where the disk does not take it.
+    format or a CRS that GeoJSON cannot have, CrsError for an unknown one.
     """
     driver = DRIVERS.get(out.suffix.lower())
     if driver is None:
@@ -46,13 +52,9 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
     source, layer = _source(results, what)
     if out.exists() and out.samefile(source):
         raise SettingsError(f"export --out {out}: that is the file it is read from; choose another name")
-    with _damage_told(source):
-        frame = pyogrio.read_dataframe(vector_file(source), layer=layer)
-        if not (frame.geom_type == "Point").all():
-            raise ValueError("there are other shapes than points")
-        if what == "candidates" and source.suffix == ".geojson" and target is None:
-            epsg = frame["epsg"].dropna()
-            target = parse_crs(f"EPSG:{int(epsg.iloc[0])}") if len(epsg) else parse_crs(LONLAT)
+    frame = _points(source, layer)
+    if what == "candidates" and source.suffix == ".geojson" and target is None:
+        target = _map_crs(source, frame)
     if target is not None:
         frame = frame.to_crs(target)
     # Columns that name a place are of the CRS that is written, or they would contradict the points.
@@ -61,43 +63,48 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
     digits = 8 if frame.crs.is_geographic else 4
     for name, values in zip(names, (frame.geometry.x, frame.geometry.y), strict=True):
         frame[name] = values.round(digits)
-    clear_scratch(out.absolute().parent)
-    with whole_file(out) as scratch, disk_errors(f"export --out {out}", out.absolute().parent):
-        if driver == "CSV":
-            columns = [*names, *(c for c in frame.columns if c not in (*names, "geometry"))]
-            frame[columns].to_csv(scratch, index=False, lineterminator="\n")
-        else:
-            _write(frame, scratch, out, what, driver)
+    if driver == "CSV":
+        columns = [*names, *(c for c in frame.columns if c not in (*names, "geometry"))]
+        table = frame[columns].map(lambda cell: plain_cell(cell) if isinstance(cell, str) else cell)
+        data = table.to_csv(index=False, lineterminator="\n").encode()
+    else:
+        # In memory first: GDAL's writer of GeoJSON does not tell that a disk is full.
+        buffer = io.BytesIO()
+        pyogrio.write_dataframe(frame, buffer, layer=what, driver=driver)
+        data = buffer.getvalue()
+    write_bytes(out, data)
     return f"wrote {out}: {what}, {len(frame)} points, {frame.crs.name}"
 
 
-def _write(frame: Any, scratch: Path, out: Path, layer: str, driver: str) -> None:
-    # GDAL does not tell of every write that a full disk did not take.
+def _points(source: Path, layer: str | None) -> geopandas.GeoDataFrame:
+    """The points of a file of results, all with a place in a known CRS; InputError for others, or a file that is damaged."""
     try:
-        pyogrio.write_dataframe(frame, scratch, layer=layer, driver=driver)
-        written = pyogrio.read_info(vector_file(scratch), layer=layer, force_feature_count=True)["features"]
-        reason = f"{written} of {len(frame)} points came through" if written != len(frame) else ""
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, InputError) as error:
-        reason = one_line(error, 120)
-    if reason:
-        raise WorkflowError(f"{out}: cannot be written ({reason}): check space and rights")
+        frame = pyogrio.read_dataframe(vector_file(source), layer=layer)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, ValueError) as error:
+        raise _damaged(source, one_line(error)) from None
+    if "geometry" not in frame or frame.crs is None:
+        raise _damaged(source, "its features have no place" if "geometry" not in frame else "it names no CRS")
+    wrong = ~(shapely.get_type_id(frame.geometry.array) == shapely.GeometryType.POINT)
+    wrong |= shapely.is_empty(frame.geometry.array)
+    if wrong.any():
+        raise _damaged(source, f"{wrong.sum()} of {len(frame)} features are no points")
+    return frame
 
 
-@contextmanager
-def _damage_told(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (
-        pyogrio.errors.DataSourceError,
-        pyogrio.errors.DataLayerError,
-        ValueError,
-        OverflowError,
-        LookupError,
-        AttributeError,  # a layer without a geometry
-    ) as error:
-        raise InputError(
-            f"{path}: not as localize wrote it ({one_line(error, 120)}): run localize again"
-        ) from None
+def _map_crs(source: Path, frame: geopandas.GeoDataFrame) -> CRS:
+    """The CRS of the map, which GeoJSON tells as a property of its points; longitude and latitude where it has no code."""
+    if not len(frame):
+        return parse_crs(LONLAT)
+    codes = frame["epsg"].dropna().unique().tolist() if "epsg" in frame else [""]
+    if not codes:
+        return parse_crs(LONLAT)
+    if len(codes) > 1 or not isinstance(codes[0], int | float) or codes[0] != int(codes[0]):
+        raise _damaged(source, "its points do not name the map's CRS as one number, epsg")
+    return parse_crs(f"EPSG:{int(codes[0])}")
+
+
+def _damaged(source: Path, why: str) -> InputError:
+    return InputError(f"{source}: not as localize wrote it ({why}): run localize again")
 
 
 def _source(results: Path, what: str) -> tuple[Path, str | None]:
@@ -114,8 +121,10 @@ def _source(results: Path, what: str) -> tuple[Path, str | None]:
     path = results / "trajectory.gpkg"
     if not path.is_file():
         raise MissingInputError(f"{path} is not there; run localize again")
-    with _damage_told(path):
+    try:
         layers = [str(name) for name, _ in pyogrio.list_layers(vector_file(path))]
+    except pyogrio.errors.DataSourceError as error:
+        raise _damaged(path, one_line(error)) from None
     if what not in layers:
         there = ", ".join(itertools.filterfalse(lambda n: n not in WHAT, layers))
         raise MissingInputError(f"{path}: these results have no {what} path; there are {there}")

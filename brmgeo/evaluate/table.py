@@ -13,7 +13,7 @@ import numpy as np
 
 from brmgeo.errors import InputError
 from brmgeo.evaluate.scores import Scores
-from brmgeo.files import json_of
+from brmgeo.files import json_of, plain_cell
 
 EARLY_M = 450.0
 #: Figures that metrics.json of earlier versions lack: their results still compare.
@@ -219,7 +219,7 @@ def rows_csv(rows: Sequence[FlightRow]) -> str:
         values = asdict(row.scores)
         within = values["within_sigma"] or (None, None, None)
         cells = [values[n] for n in names] + [*within, row.seconds_per_frame, row.first_frame_s]
-        writer.writerow([row.flight, row.seed, row.method, *(_cell(c) for c in cells)])
+        writer.writerow([plain_cell(row.flight), row.seed, row.method, *(_cell(c) for c in cells)])
     return buffer.getvalue()
 
 

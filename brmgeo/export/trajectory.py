@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from brmgeo.export import iso_utc, qgis_style, shown_until_ms, utc_ms
 from brmgeo.export.vector import epsg_of, lonlat, number, write_geojson, write_layer
-from brmgeo.files import whole_file, write_text
+from brmgeo.files import plain_cell, whole_file, write_text
 from brmgeo.flight.values import Estimate
 from brmgeo.geo.crs import parse_crs
 
@@ -140,7 +140,8 @@ def fixes_rows(estimates: Sequence[Estimate], files: Sequence[str], crs: str) ->
     """One row of ``FIXES_HEADER`` a frame, as FLIGHT.md says.
 
     ``x, y, lon, lat`` are empty unless the status is converged; whatever is not known (NaN) is empty too. ``yaw_deg`` is
-    counter-clockwise from east in [-180, 180), ``heading_deg`` clockwise from grid north in [0, 360).
+    counter-clockwise from east in [-180, 180), ``heading_deg`` clockwise from grid north in [0, 360). ``file`` is a
+    ``plain_cell``.
     """
     track = converged_track(estimates)
     degrees = iter(lonlat(track.xy, crs)) if len(track.t_s) else iter(())
@@ -156,7 +157,7 @@ def fixes_rows(estimates: Sequence[Estimate], files: Sequence[str], crs: str) ->
         rows.append(
             (
                 _time(estimate.t_s),
-                file,
+                plain_cell(file),
                 estimate.status,
                 *place,
                 _text(sigma, 3),

@@ -193,13 +193,13 @@ def copy_thinned(flight: Flight, rows: Sequence[int], out: Path) -> None:
     full = [i for i, line in enumerate(lines) if line.strip()]
     for path in sorted(flight.folder.iterdir()):
         if path.is_file() and path.name != "frames.csv" and not path.name.startswith("."):
-            shutil.copy2(path, out / path.name)
+            shutil.copyfile(path, out / path.name)
     for folder, wanted in (("frames", flight.has_images), ("masks", flight.has_masks)):
         for i in rows if wanted else []:
             name = PurePosixPath(flight.frames[int(i)].file)
             source = name if folder == "frames" else name.with_suffix(".png")
             (out / folder / source).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(flight.folder / folder / source, out / folder / source)
+            shutil.copyfile(flight.folder / folder / source, out / folder / source)
     chosen = [lines[full[0]], *(lines[full[1 + int(i)]] for i in rows)]
     files.write_text(out / "frames.csv", "\n".join(chosen) + "\n")
 

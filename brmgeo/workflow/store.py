@@ -34,7 +34,7 @@ from urllib.parse import quote
 from brmgeo import files
 from brmgeo.errors import WorkflowError
 from brmgeo.workflow.digests import Digests, Signature, signature
-from brmgeo.workflow.disk import disk_errors, is_full
+from brmgeo.workflow.disk import disk_errors
 from brmgeo.workflow.stage import Json, Map, S, Stage, canonical, key_of, plain
 
 RECORD = "provenance.json"
@@ -250,7 +250,7 @@ class Store:
             files.sync(out / name)
             outputs[name] = {"sha256": files.digest(out / name), "size": (out / name).stat().st_size}
         # GDAL can lose the last blocks on a full disk without an exception: no room at all is reason enough.
-        if is_full(self.root):
+        if files.is_full(self.root):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out))
         record: Json = step.origin | {
             "label": step.label,

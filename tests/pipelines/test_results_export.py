@@ -160,3 +160,73 @@ def test_the_command_refuses_a_folder_that_is_no_result(
     assert "brmgeo localize wrote" in capfd.readouterr().err
     assert call("export", results, "--out", tmp_path / "a.csv") == 0
     assert "online, 4 points" in capfd.readouterr().out
+
+
+def _text(words: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(words)
+
+
+def _features(geometry: str, properties: str = "{}") -> Callable[[Path], object]:
+    feature = f'{{"type":"Feature","geometry":{geometry},"properties":{properties}}}'
+    return _text(f'{{"type":"FeatureCollection","features":[{feature}]}}')
+
+
+POINT = '{"type":"Point","coordinates":[127,37]}'
+
+
+@pytest.mark.parametrize(
+    ("what", "damage", "words"),
+    [
+        ("candidates", _text(""), "candidates.geojson"),
+        ("candidates", _text('{"type":"FeatureCollection","features":['), "candidates.geojson"),
+        ("candidates", _features("null"), "run localize again"),
+        ("candidates", _features('{"type":"LineString","coordinates":[[127,37],[127.1,37]]}'), "no points"),
+        ("candidates", _features(POINT), "epsg"),
+        ("candidates", _features(POINT, '{"epsg":"x"}'), "epsg"),
+        ("candidates", _features(POINT, '{"epsg":0.5}'), "epsg"),
+        ("candidates", _features(POINT, '{"epsg":-7}'), "EPSG:-7"),
+        ("online", lambda path: path.write_bytes(path.read_bytes()[:4000]), "trajectory.gpkg"),
+        ("online", lambda path: path.write_bytes(b"\0" * 5000), "trajectory.gpkg"),
+        (
+            "online",
+            lambda path: path.write_bytes(path.read_bytes()[:8192] + b"\7" * 90_000),
+            "trajectory.gpkg",
+        ),
+    ],
+)
+def test_damaged_results_are_told_and_nothing_is_written(
+    results: Path, tmp_path: Path, what: str, damage: Callable[[Path], object], words: str
+) -> None:
+    damage(results / ("candidates.geojson" if what == "candidates" else "trajectory.gpkg"))
+    with pytest.raises(BrmgeoError, match=re.escape(words)) as told:
+        export_results(results, what, tmp_path / "a.csv", None)
+    assert isinstance(told.value, InputError | CrsError)
+    assert "\n" not in str(told.value)
+    assert [p.name for p in tmp_path.iterdir()] == ["results"]
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.geojson", "a.gpkg"])
+def test_a_full_disk_is_one_line_with_the_place(
+    results: Path, small_disk: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (small_disk / "ballast").write_bytes(bytes(1 << 20))
+    words = ["export", str(results), "--out", str(small_disk / name)]
+    assert run(lambda: cli(words, standalone_mode=False)) == 2
+    told = capfd.readouterr().err
+    assert f"{small_disk / name} cannot be read or written: the disk is full" in told
+    assert told.count("\n") == 1
+    assert [p.name for p in small_disk.iterdir()] == ["ballast"]
+
+
+def test_no_cell_is_a_formula_and_numbers_stay_numbers(results: Path, tmp_path: Path) -> None:
+    names = ["=1+1.jpg", "+a.jpg", "-2+3.jpg", "@SUM(1).jpg", "'=a.jpg", "a.jpg"]
+    places = [-195_100.25 - i for i in range(6)]
+    frame = pyogrio.read_dataframe(results / "candidates.geojson")
+    frame["file"], frame["number"] = names, places
+    for name in ("candidates.geojson", "candidates.gpkg"):
+        (results / name).unlink(missing_ok=True)
+    pyogrio.write_dataframe(frame, results / "candidates.gpkg")
+    export_results(results, "candidates", tmp_path / "a.csv", None)
+    rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()))
+    assert [r["file"] for r in rows] == [*(f"'{n}" for n in names[:5]), "a.jpg"]
+    assert [float(r["number"]) for r in rows] == places
