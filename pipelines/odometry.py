@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError
-from brmgeo.files import whole_folder
+from brmgeo.files import whole_files, whole_folder
 from brmgeo.flight.folder import MADE_BY, is_own_odometry, read_flight
 from brmgeo.flight.own import OdometryMethod, estimate, thinned_rows
 from brmgeo.flight.write import copy_thinned, name_track, rounded_track, write_facts, write_track
 from brmgeo.workflow.disk import disk_errors
+from brmgeo.workflow.progress import Progress
 
 
 def method_named(name: str) -> OdometryMethod:
@@ -30,14 +31,14 @@ def make_odometry(flight_dir: Path, method: OdometryMethod = "auto") -> dict[str
     ``odometry.tum`` (poses), ``odometry.covariance.csv`` (what they are worth), ``odometry.json`` (facts); flight.toml gets
     an [odometry] section, so that localize reads them. A flight that came with odometry of its own keeps it: then the
     names begin with ``embedded`` and flight.toml stays as it is. A run that is killed leaves a folder that the next one
-    mends: the facts come first and tell whose the files are, flight.toml last.
+    mends: the facts come first and tell whose the files are, flight.toml last. A track that somebody changed since it was
+    written there is set aside.
     """
     ours = is_own_odometry(flight_dir)
     flight = read_flight(flight_dir, with_odometry=not ours)
     stem = "odometry" if flight.odometry is None else "embedded"
     made = estimate(flight, method)
     facts = made.facts | {"track": f"{stem}.tum", "covariance": f"{stem}.covariance.csv"}
-    write_facts(flight_dir, stem, facts)
     columns: dict[str, NDArray[Any]] = {
         "yaw_sigma_deg": np.round(np.degrees(made.yaw_sigma_rad), 4),
         "tracks": made.tracks,
@@ -45,7 +46,10 @@ def make_odometry(flight_dir: Path, method: OdometryMethod = "auto") -> dict[str
     }
     track = rounded_track(made.odometry)
     track = replace(track, wxyz=np.round(track.wxyz, 9))
-    section = write_track(flight_dir, track, stem=stem, columns=columns)
+    names = (f"{stem}.json", facts["track"], facts["covariance"])
+    with whole_files(flight_dir, names, Progress().say) as work:
+        write_facts(work, stem, facts)
+        section = write_track(work, track, stem=stem, columns=columns)
     name_track(flight_dir, section, MADE_BY)
     return facts
 

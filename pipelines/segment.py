@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
-from brmgeo.files import write_bytes, write_json
+from brmgeo.files import WRITTEN, read_json, write_json, write_listed
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.locate.masks import frame_gsd_m, frame_picture, stored_of
 from brmgeo.pictures import SUFFIXES, encode
@@ -36,7 +36,8 @@ def segment(
 
     Args:
         source: a flight folder, a folder of images, or a GeoTIFF.
-        out: a folder for masks (STEM.png), or the GeoTIFF to write.
+        out: a folder for masks (STEM.png), or the GeoTIFF to write. A mask that somebody changed since it was written there
+            is set aside.
         answer: ``mask`` (frames: 0 and 255; rasters: 0, 1, 255 = unknown) or ``probability`` (frames: 0 to 254, 255 =
             unknown; rasters: steps of 1e-4).
         gsd_m: metres per pixel of images in a plain folder; flights and rasters know theirs.
@@ -121,11 +122,13 @@ def _segment_pictures(
     out.mkdir(parents=True, exist_ok=True)
     # Before the masks, so that the same command may go on where one was killed.
     write_json(out / SIGN, facts)
-    with Progress().stage("masks") as bar:
+    progress = Progress()
+    with progress.stage("masks") as bar:
         for done, (job, name) in enumerate(zip(jobs, names, strict=True), start=1):
             probability = segmenter.probability(job.picture(), job.gsd_m)
             mask = thresholded(probability, segmenter.card.threshold)
-            write_bytes(out / name, encode(mask if answer == "mask" else stored_of(probability)))
+            data = encode(mask if answer == "mask" else stored_of(probability))
+            write_listed(out / name, data, progress.say)
             share += float((mask > 0).mean()) / len(jobs)
             bar.update(done, len(jobs))
     write_json(out / SIGN, {**facts, "finished": True, "building_share": round(share, 6)})
@@ -143,7 +146,9 @@ def _may_write(source: Path, out: Path, names: Sequence[str]) -> None:
         raise SettingsError(
             f"--out {out}: there are other files than masks; give a new folder or an empty one"
         )
-    others = sorted({p.name for p in out.glob("*.png")} - set(names))
+    # What is not listed is none of our masks: it stays.
+    listed = read_json(out / WRITTEN)
+    others = sorted({p.name for p in out.glob("*.png") if listed is None or p.name in listed} - set(names))
     if others:
         raise SettingsError(
             f"--out {out}: there are masks of other images ({others[0]}{' and others' if others[1:] else ''}); give a new "

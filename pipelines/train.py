@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.extras import extra
-from brmgeo.files import write_bytes, write_json, write_text
+from brmgeo.files import whole_files, write_json, write_listed
 from brmgeo.region import load_region
 from brmgeo.segment.predict import cores
 from brmgeo.segment.shards import TileSet, read_tiles
@@ -231,10 +231,9 @@ def train(
 
     def on_epoch(run: engine.Run, probability: F32) -> None:
         last, epochs = run.history[-1], [asdict(e) for e in run.history]
-        write_text(out / "curves.csv", training_table(epochs))
-        write_bytes(out / "curves.png", training_figure(epochs))
-        (out / "pictures").mkdir(exist_ok=True)
-        write_bytes(out / "pictures" / f"epoch-{last.epoch:03d}.png", crops_figure(*crops, probability))
+        write_listed(out / "curves.csv", training_table(epochs).encode(), say)
+        write_listed(out / "curves.png", training_figure(epochs), say)
+        write_listed(out / "pictures" / f"epoch-{last.epoch:03d}.png", crops_figure(*crops, probability), say)
         say(
             f"epoch {last.epoch}, step {last.step}: loss {last.loss:.3f}, validation loss {last.validation_loss:.3f}, "
             f"IoU {last.validation_iou:.3f}"
@@ -253,7 +252,8 @@ def train(
         "seconds_of_this_run": round(time.monotonic() - started),
         "device": trainer.device.type,
     }
-    write_json(out / "metrics.json", facts)
+    with whole_files(out, ["metrics.json"], say) as made:
+        write_json(made / "metrics.json", facts)
     return facts
 
 

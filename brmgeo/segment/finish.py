@@ -15,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from brmgeo.codes import LABEL_UNKNOWN as UNKNOWN
-from brmgeo.files import whole_files, write_bytes
+from brmgeo.files import set_aside, whole_files, write_bytes
 from brmgeo.segment.augment import MEAN, STD
 from brmgeo.segment.ground import ScoredFrame, TrainingGround
 from brmgeo.segment.metrics import LogitHistogram, MaskScores, best_threshold, segmentation_scores
@@ -103,7 +103,9 @@ def finish(
         export_onnx(weights, made / "model.onnx")
         write_bytes(made / "reliability.png", reliability({"as trained": before, "calibrated": after}))
         # What belongs to other weights goes before they do.
-        for name in ("model.onnx", "metrics.json"):
+        belongings = ("model.onnx", "metrics.json")
+        set_aside(out, belongings, say)
+        for name in belongings:
             (out / name).unlink(missing_ok=True)
     return {"calibration": calibration, "scores": scores}
 
