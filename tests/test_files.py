@@ -208,6 +208,63 @@ def test_several_files_come_together_or_none_does(tmp_path: Path) -> None:
     assert there() == {"a": "three", "b": "three", "other": "stays"}
 
 
+FULL = (
+    OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+    OSError("[Errno 28] Error writing bytes to file. Detail: No space left on device"),
+    RuntimeError("sqlite3_step failed: database or disk is full"),
+)
+
+
+@pytest.mark.parametrize("error", FULL, ids=["the system", "an OSError of a library", "a library"])
+def test_a_full_disk_is_named_by_the_result_whichever_library_met_it(
+    tmp_path: Path, error: Exception
+) -> None:
+    doors: dict[str, AbstractContextManager[Path]] = {
+        "a.txt": files.whole_file(tmp_path / "a.txt"),
+        "out": files.whole_folder(tmp_path / "out"),
+        "": files.whole_files(tmp_path, ["b.txt"], print),
+    }
+    for name, door in doors.items():
+        with pytest.raises(OSError) as told, door:
+            raise error
+        assert (told.value.errno, told.value.filename) == (errno.ENOSPC, str(tmp_path / name))
+    inner = tmp_path / "inner" / "c.txt"
+    inner.parent.mkdir()
+    with pytest.raises(OSError) as told, files.whole_folder(tmp_path / "out"), files.whole_file(inner):
+        raise error
+    assert told.value.filename == str(inner), "the nearest place is told"
+    with pytest.raises(OSError) as told, files.whole_folder(tmp_path / "out") as work:
+        _fill(work / "d.txt", error)
+    assert told.value.filename == str(tmp_path / "out"), "scratch has no name that people know"
+    assert names_in(tmp_path) == ["inner"]
+
+
+def _fill(path: Path, error: Exception) -> None:
+    with files.whole_file(path):
+        raise error
+
+
+def test_a_full_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(OSError) as told, files.scratch_folder("work"):
+        raise FULL[0]
+    assert str(told.value.filename).startswith(str(tmp_path / "brmgeo-work-"))
+
+
+def test_a_defect_is_no_disk(tmp_path: Path) -> None:
+    for error in (KeyError("a"), FileNotFoundError(errno.ENOENT, "x", "b"), WorkflowError("disk is full")):
+        with pytest.raises(type(error)) as told, files.whole_file(tmp_path / "a"):
+            raise error
+        assert told.value is error
+
+
+def test_a_cell_is_no_formula_and_reads_back() -> None:
+    for text in ("=1+1", "+a", "-2+3", "@SUM(1)", "\tx", "\rx", "'=1", "''@"):
+        assert files.plain_cell(text) == f"'{text}"
+    for text in ("", "a=1.jpg", "frame_00001.jpg", "'quoted'", "3-4"):
+        assert files.plain_cell(text) == text
+
+
 @pytest.mark.skipif(os.name != "posix", reason="file modes are POSIX's")
 def test_folders_have_the_mode_that_the_umask_asks_for(tmp_path: Path) -> None:
     # In a process of its own: the umask belongs to the whole process.
@@ -412,6 +469,11 @@ def test_files_that_are_replaced_are_set_aside_where_they_are_not_ours(tmp_path:
         (work / "a.txt").write_text("third")
     assert (tmp_path / "a.txt").read_text() == "third"
     assert (tmp_path / "a.edited.txt").read_text() == "edited"
+    assert len(told) == 1
+    # What is already there, by a run that was killed before it was listed, is nothing that could be lost.
+    (tmp_path / "b.txt").write_text("same")
+    files.write_listed(tmp_path / "b.txt", b"same", told.append)
+    files.write_listed(tmp_path / "b.txt", b"newer", told.append)
     assert len(told) == 1
 
 

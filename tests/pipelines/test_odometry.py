@@ -43,6 +43,14 @@ def test_a_flight_without_odometry_gets_one(folder: Path, tmp_path: Path) -> Non
     # Again: the same names, one section.
     make_odometry(folder)
     assert (folder / "flight.toml").read_text().count("[odometry]") == 1
+    assert not list(folder.glob("*.edited.*"))
+    # A track that somebody changed is kept.
+    made = (folder / "odometry.tum").read_text()
+    (folder / "odometry.tum").write_text(f"# mine\n{made}")
+    make_odometry(folder)
+    assert (folder / "odometry.tum").read_text() == made
+    assert (folder / "odometry.edited.tum").read_text() == f"# mine\n{made}"
+    (folder / "odometry.edited.tum").unlink()
 
     thin = thin_flight(folder, tmp_path / "thin", 5.0)
     few = read_flight(thin)

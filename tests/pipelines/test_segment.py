@@ -91,6 +91,25 @@ def test_segment_a_flight_and_a_folder(
     assert bytes_of(tmp_path / "k") == before
 
 
+def test_masks_that_somebody_corrected_are_kept(weights: Path, tmp_path: Path, say: Say) -> None:
+    folder, out = tmp_path / "images", tmp_path / "masks"
+    folder.mkdir()
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(folder / name), town(40, 60))
+    words = ("segment", folder, "--weights", weights, "--out", out)
+    assert say(*words).code == 0
+    made = (out / "a.png").read_bytes()
+    assert "kept" not in say(*words).err
+    cv2.imwrite(str(out / "a.png"), np.full((40, 60), 255, np.uint8))
+    corrected = (out / "a.png").read_bytes()
+    said = say(*words)
+    assert "a.png: not as brmgeo wrote it, so it is kept as a.edited.png" in said.out + said.err
+    assert (out / "a.edited.png").read_bytes() == corrected
+    assert (out / "a.png").read_bytes() == made
+    assert say(*words).code == 0, "what was set aside is no mask of another image"
+    assert sorted(p.name for p in out.glob("[!.]*")) == ["a.edited.png", "a.png", "b.png", SIGN]
+
+
 # ---------------------------------------------------------------- rasters
 
 

@@ -226,7 +226,7 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
     facts = job.train(recipe, tmp_path, out, say=said.append)
     assert facts["training"]["epochs_kept"] == [2, 2]
     assert any("flown: not tested on" in line for line in said)
-    made = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    made = {p.relative_to(out).as_posix() for p in out.rglob("[!.]*") if p.is_file()}
     assert made == {
         "checkpoint.safetensors", "curves.csv", "curves.png", "metrics.json", "model.onnx", "reliability.png",
         "model.md", "model.safetensors", "pictures/epoch-001.png", "pictures/epoch-002.png",
@@ -253,7 +253,10 @@ def test_a_whole_run_writes_its_files_and_goes_on_where_it_ended(tmp_path: Path)
     assert len((out / "curves.csv").read_text().splitlines()) == 3
     weights = (out / "model.safetensors").read_bytes()
     said.clear()
+    (out / "metrics.json").write_text("with notes")
     job.train(recipe, tmp_path, out, say=said.append)
+    assert (out / "metrics.edited.json").read_text() == "with notes"
+    assert [p.name for p in out.rglob("*.edited.*")] == ["metrics.edited.json"]
     assert not any(line.startswith("epoch") for line in said)
     assert (out / "model.safetensors").read_bytes() == weights
     recipe.write_text(averaged.replace("seeds = [901]", "seeds = [901]\nweight = 2.0"))

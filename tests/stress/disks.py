@@ -15,7 +15,17 @@ from arena import FAULTS, Arena
 from kills import JOBS, digests, start
 
 # Those whose results all go below one folder.
-NAMES = ("maps --footprints", "simulate", "localize", "segment", "odometry", "import", "export", "evaluate")
+NAMES = (
+    "maps --footprints",
+    "simulate",
+    "localize",
+    "segment",
+    "odometry",
+    "import",
+    "export",
+    "evaluate",
+    "train",
+)
 
 
 PAGE = 4096
