@@ -15,17 +15,7 @@ from arena import FAULTS, Arena
 from kills import JOBS, digests, start
 
 # Those whose results all go below one folder.
-NAMES = (
-    "maps --footprints",
-    "simulate",
-    "localize",
-    "segment",
-    "odometry",
-    "import",
-    "export",
-    "evaluate",
-    "train",
-)
+NAMES = ("maps --footprints", "simulate", "localize", "segment", "odometry", "import", "export", "evaluate")
 
 
 PAGE = 4096
