@@ -35,7 +35,7 @@ Say = Callable[[str], object]
 _OLD = ".old"
 _LEAST_FREE = 4096
 # What a disk does to what is being written.
-_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 _REASONS = {
     errno.ENOSPC: "the disk is full: free some space or choose another place",

@@ -7,12 +7,13 @@ import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pyogrio
 import pyogrio.errors
 import shapely
 from pyproj import CRS
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError, one_line
+from brmgeo.errors import CrsError, InputError, MissingInputError, SettingsError, one_line
 from brmgeo.files import plain_cell, write_bytes
 from brmgeo.geo.crs import LONLAT, parse_crs
 from brmgeo.geo.formats import vector_file
@@ -41,6 +42,11 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
             f"export --out {out}: give a name that ends in one of {', '.join(DRIVERS)} (trajectory.tum is in the results)"
         )
     target = None if crs is None else parse_crs(crs)
+    if target is not None and (not (target.is_projected or target.is_geographic)):
+        raise CrsError(
+            f"crs {crs!r} is {target.name}, which has no x, y or longitude, latitude: give another",
+            needs="crs",
+        )
     if driver == "GeoJSON":
         if target is not None and target != parse_crs(LONLAT):
             raise SettingsError(
@@ -57,6 +63,10 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
         target = _map_crs(source, frame)
     if target is not None:
         frame = frame.to_crs(target)
+        if not np.isfinite(shapely.get_coordinates(frame.geometry.array)).all():
+            raise CrsError(
+                f"{source}: points of {what} have no place in {target.name}: give another CRS", needs="crs"
+            )
     # Columns that name a place are of the CRS that is written, or they would contradict the points.
     frame = frame.drop(columns=[c for c in ("x", "y", "epsg") if c in frame])
     names = ("lon", "lat") if frame.crs.is_geographic else ("x", "y")

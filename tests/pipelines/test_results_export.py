@@ -88,6 +88,9 @@ def test_points_are_those_of_the_results_in_every_format(results: Path, tmp_path
         ("online", "none/a.csv", None, SettingsError, "no folder"),
         ("online", "a.geojson", "EPSG:5187", SettingsError, "leave --crs out"),
         ("online", "a.csv", "EPSG:999999", CrsError, "999999"),
+        ("online", "a.csv", "EPSG:5773", CrsError, "EGM96 height, which has no x, y"),
+        ("online", "a.csv", "EPSG:4978", CrsError, "which has no x, y"),
+        ("online", "a.csv", "+proj=ortho +lat_0=-37 +lon_0=-53", CrsError, "no place in"),
         ("online", "results/trajectory.gpkg", None, SettingsError, "choose another name"),
     ],
 )
