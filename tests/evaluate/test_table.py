@@ -75,6 +75,7 @@ def test_markdown_text_and_csv_hold_every_method_and_flight() -> None:
     read = list(csv.DictReader(io.StringIO(rows_csv(all_rows))))
     assert [r["method"] for r in read] == ["mask", "mask", "ratio"]
     assert read[1]["first_fix_m"] == ""
+    assert rows_csv([replace(all_rows[0], flight="@SUM(1)")]).splitlines()[1].startswith("'@SUM(1),")
     assert float(read[0]["within_2_sigma"]) == 0.9
 
 

@@ -33,12 +33,12 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 def test_fixes_has_the_contract_s_columns_and_a_place_only_where_converged(tmp_path: Path) -> None:
     estimates = flight()
     files = [f"{i:04d}.jpg" for i in range(len(estimates))]
-    files[5] = 'odd, "name".jpg'
+    files[5], files[6] = 'odd, "name".jpg', "=1+1.jpg"
     path = write_fixes(tmp_path / "fixes.csv", estimates, files, CRS)
     header = path.read_text(encoding="utf-8").splitlines()[0]
     assert header == "t_s,file,status,x,y,lon,lat,sigma_m,yaw_deg,heading_deg,candidates,mass"
     rows = rows_of(path)
-    assert [r["file"] for r in rows] == files
+    assert [r["file"] for r in rows] == [*files[:6], "'=1+1.jpg", *files[7:]]
     assert [r["status"] for r in rows] == [e.status for e in estimates]
     to_lonlat = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True)
     for row, e in zip(rows, estimates):

@@ -52,8 +52,10 @@ def test_a_flight_without_odometry_gets_one(folder: Path, tmp_path: Path) -> Non
     assert (folder / "odometry.edited.tum").read_text() == f"# mine\n{made}"
     (folder / "odometry.edited.tum").unlink()
 
+    (folder / "imu.csv").chmod(0o666)
     thin = thin_flight(folder, tmp_path / "thin", 5.0)
     few = read_flight(thin)
+    assert (thin / "imu.csv").stat().st_mode == (thin / "frames.csv").stat().st_mode, "as the umask asks"
     assert [f.t_s for f in few.frames] == [0.0, 5.0, 10.0, 15.0]
     assert few.odometry is not None
     with pytest.raises(InputError, match="new or empty"):
