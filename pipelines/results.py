@@ -14,7 +14,7 @@ import shapely
 from pyproj import CRS
 
 from brmgeo.errors import CrsError, InputError, MissingInputError, SettingsError, one_line
-from brmgeo.files import plain_cell, write_bytes
+from brmgeo.files import plain_cell, read_json, write_bytes
 from brmgeo.geo.crs import LONLAT, parse_crs
 from brmgeo.geo.formats import vector_file
 
@@ -98,6 +98,11 @@ def _points(source: Path, layer: str | None) -> geopandas.GeoDataFrame:
     wrong |= shapely.is_empty(frame.geometry.array)
     if wrong.any():
         raise _damaged(source, f"{wrong.sum()} of {len(frame)} features are no points")
+    # GDAL passes over what is no feature without a word.
+    told = read_json(source) if source.suffix == ".geojson" else None
+    features = told.get("features") if isinstance(told, dict) else None
+    if isinstance(features, list) and len(features) != len(frame):
+        raise _damaged(source, f"{len(features) - len(frame)} of {len(features)} features are none")
     return frame
 
 

@@ -182,6 +182,7 @@ POINT = '{"type":"Point","coordinates":[127,37]}'
     [
         ("candidates", _text(""), "candidates.geojson"),
         ("candidates", _text('{"type":"FeatureCollection","features":['), "candidates.geojson"),
+        ("candidates", _text('{"type":"FeatureCollection","features":["a"]}'), "1 of 1 features are none"),
         ("candidates", _features("null"), "run localize again"),
         ("candidates", _features('{"type":"LineString","coordinates":[[127,37],[127.1,37]]}'), "no points"),
         ("candidates", _features(POINT), "epsg"),
