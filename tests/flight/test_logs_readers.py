@@ -325,6 +325,8 @@ def test_a_row_of_a_text_log_that_is_no_number_is_left_out(tmp_path: Path, wrong
     imu = read_log(path).imu
     assert imu is not None
     assert len(imu.t_s) in (399, 400)  # a comma splits it into two numbers
+
+
 def test_a_wrong_length_in_a_ulog_costs_the_messages_beside_it_and_is_told() -> None:
     from brmgeo.flight.logs.ulog import _whole_messages
 
