@@ -6,19 +6,34 @@ after the ArduPilot "Log Messages".
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from brmgeo.errors import FlightError
+from brmgeo.files import scratch_folder
 from brmgeo.flight.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, quaternion_from_euler
 from brmgeo.flight.logs.mavlink import Clock, Messages, library, opened, read_telemetry, rows_of
-from brmgeo.flight.logs.values import Gnss, Height, Log, LogOptions, Orientation, choose, mixed
+from brmgeo.flight.logs.values import (
+    Gnss,
+    Height,
+    Log,
+    LogOptions,
+    Orientation,
+    choose,
+    mixed,
+    tell_lost,
+    tell_unread,
+)
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 
 #: Filters in order of worth: EKF3, EKF2, EKF1 of the TimeMS era (positions PN, PE, PD), and visual odometry.
 _FILTERS = ("XKF1", "NKF1", "EKF1")
+_HEAD = b"\xa3\x95"
+_FORMAT = 0x80  # of the messages that tell the lengths of the others
+_PAGE = 528  # bytes of a page of dataflash
 _DATAFLASH = (
     *_FILTERS,
     "ATT",
@@ -45,22 +60,22 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
     options = options or LogOptions()
     if path.suffix.lower() == ".tlog":
         return read_telemetry(path, options)
-    found = _messages(path)
     notes: list[str] = []
+    found = _messages(path, notes)
     time = _boot_seconds(found)
-    euler = rows_of(found.get("ATT", []), lambda m: [time(m), m.Roll, m.Pitch, m.Yaw])
+    euler = rows_of(found.get("ATT", []), lambda m: [time(m), m.Roll, m.Pitch, m.Yaw], notes)
     attitude = None
     if euler.size:
         attitude = Orientation(euler[:, 0], _from_degrees(euler[:, 1:4]), True, "ATT")
     counts, odometry = _odometry(path, found, time, attitude, options, notes)
-    gnss = _gnss(found, time)
+    gnss = _gnss(found, time, notes)
     own = odometry is not None and odometry.source != "VISP"
     if odometry is not None and own:
         more = (
             ", which GNSS goes into: it is no odometry of a flight without GNSS" if gnss is not None else ""
         )
         notes.append(f"{odometry.source} is the autopilot's own estimate{more}")
-    cameras = rows_of(found.get("CAM", []) or found.get("TRIG", []), lambda m: [time(m)])
+    cameras = rows_of(found.get("CAM", []) or found.get("TRIG", []), lambda m: [time(m)], notes)
     return Log(
         kind="ardupilot",
         title=next((str(m.Message) for m in found.get("MSG", [])), "ArduPilot dataflash log"),
@@ -68,8 +83,8 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
         odometry=odometry,
         uses_gnss=gnss is not None if own else None,
         candidates=counts,
-        imu=_imu(found, time),
-        height=_height(found, time, odometry),
+        imu=_imu(found, time, notes),
+        height=_height(found, time, odometry, notes),
         attitude=attitude,
         gnss=gnss,
         triggers_s=cameras[:, 0] if cameras.size else None,
@@ -77,18 +92,24 @@ def read_ardupilot(path: Path, options: LogOptions | None = None) -> Log:
     )
 
 
-def _messages(path: Path) -> Messages:
-    with library(path) as (reader, _):
+def _messages(path: Path, notes: list[str]) -> Messages:
+    with library(path) as (reader, _), ExitStack() as stack:
         if path.suffix.lower() == ".log":
             log = reader.DFReader_text(str(path), zero_time_base=True)
         else:
-            with path.open("rb") as file:
-                begins = file.read(2)
-            if begins != b"\xa3\x95":
+            data = path.read_bytes()
+            if data[:2] != _HEAD:
                 raise FlightError(
                     f"{path}: no ArduPilot dataflash log: it does not begin with a message header"
                 )
-            log = reader.DFReader_binary(str(path), zero_time_base=True)
+            whole, unread = _whole_messages(data)
+            source = path
+            if unread:
+                # The library stops at the first type that it does not know, and reads files by their names alone.
+                source = stack.enter_context(scratch_folder("log")) / path.name
+                source.write_bytes(whole)
+            tell_unread(notes, unread, len(data))
+            log = reader.DFReader_binary(str(source), zero_time_base=True)
         try:
             found = opened(_DATAFLASH, log)
         finally:
@@ -100,6 +121,40 @@ def _messages(path: Path) -> Messages:
     return found
 
 
+def _whole_messages(data: bytes) -> tuple[bytes, list[tuple[int, int]]]:
+    """The log without what does not lead from one message to the next, and the (start, end) of what was left out.
+
+    A message counts where its type has a length, and it ends where another begins or the file ends. A way is found again
+    at the next such message.
+    """
+    lengths = {_FORMAT: 89}
+    at = kept = 0
+    unread: list[tuple[int, int]] = []
+    pieces = []
+    lost: int | None = None
+    while at + 3 <= len(data):
+        length = lengths.get(data[at + 2], 0) if data[at : at + 2] == _HEAD else 0
+        end = at + length
+        if length and (data[end : end + 2] == _HEAD or end == len(data) or len(data) - end < _PAGE):
+            if lost is not None:
+                pieces.append(data[kept:lost])
+                unread.append((lost, at))
+                kept, lost = at, None
+            if data[at + 2] == _FORMAT and end <= len(data):
+                lengths[data[at + 3]] = data[at + 4]
+            at = end
+        else:
+            lost = at if lost is None else lost
+            found = data.find(_HEAD, at + 1)
+            at = found if found >= 0 else len(data)
+    # Logs are written in pages: what stands behind the last message within one is no loss.
+    if lost is not None and len(data) - lost >= _PAGE:
+        pieces.append(data[kept:lost])
+        unread.append((lost, len(data)))
+        kept = len(data)
+    return b"".join([*pieces, data[kept:]]), unread
+
+
 def _odometry(
     path: Path,
     found: Messages,
@@ -109,11 +164,12 @@ def _odometry(
     notes: list[str],
 ) -> tuple[tuple[str, ...], Odometry | None]:
     # The names of every track that is there, and the chosen one.
-    streams = {name: _core(found[name]) for name in _FILTERS if name in found}
+    streams = {name: _core(found[name], notes) for name in _FILTERS if name in found}
     counts = {name: len(rows) for name, rows in streams.items() if rows}
     seen = rows_of(
         found.get("VISP", []),
         lambda m: [time(m), m.PX, m.PY, m.PZ, m.Roll, m.Pitch, m.Yaw, getattr(m, "Rst", 0)],
+        notes,
     )
     if seen.size:
         counts = {"VISP": len(seen)} | counts
@@ -124,7 +180,7 @@ def _odometry(
         segment = seen[:, 7].astype(np.int64)
         xyz = enu_from_ned(seen[:, 1:4])
         return tuple(counts), Odometry(seen[:, 0], xyz, _from_degrees(seen[:, 4:7]), "VISP", segment)
-    rows = rows_of(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw])
+    rows = rows_of(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw], notes)
     # The filter says zero until it has an origin.
     begun = np.flatnonzero(rows[:, 1:4].any(axis=1)) if rows.size else np.empty(0, np.int64)
     if not begun.size:
@@ -138,9 +194,9 @@ def _odometry(
     return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream)
 
 
-def _imu(found: Messages, time: Clock) -> Imu | None:
+def _imu(found: Messages, time: Clock, notes: list[str]) -> Imu | None:
     inertial = [m for m in found.get("IMU", []) if getattr(m, "I", 0) == 0]
-    rows = rows_of(inertial, lambda m: [time(m), m.GyrX, m.GyrY, m.GyrZ, m.AccX, m.AccY, m.AccZ])
+    rows = rows_of(inertial, lambda m: [time(m), m.GyrX, m.GyrY, m.GyrZ, m.AccX, m.AccY, m.AccZ], notes)
     return Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]), flu_from_frd(rows[:, 4:7])) if rows.size else None
 
 
@@ -157,38 +213,40 @@ def _boot_seconds(found: Messages) -> Clock:
     return seconds
 
 
-def _core(messages: list[Any]) -> list[Any]:
+def _core(messages: list[Any], notes: list[str]) -> list[Any]:
     # One estimator of those that run side by side: the first core.
     key = next((k for k in ("C", "I") if hasattr(messages[0], k)), None)
     if key is None:
         return messages
     first = min(getattr(m, key) for m in messages)
-    return [m for m in messages if getattr(m, key) == first]
+    own = [m for m in messages if getattr(m, key) == first]
+    tell_lost(notes, messages[0].get_type(), len(own), len(messages), f"of other cores than {first}")
+    return own
 
 
 def _from_degrees(angles: FloatArray) -> FloatArray:
     return enu_flu_from_ned_frd(quaternion_from_euler(*np.radians(angles).T))
 
 
-def _gnss(found: Messages, time: Clock) -> Gnss | None:
+def _gnss(found: Messages, time: Clock, notes: list[str]) -> Gnss | None:
     fixes = [m for m in found.get("GPS", []) if getattr(m, "Status", 0) >= 3 and getattr(m, "I", 0) == 0]
-    rows = rows_of(fixes, lambda m: [time(m), m.Lng, m.Lat, m.Alt])
+    rows = rows_of(fixes, lambda m: [time(m), m.Lng, m.Lat, m.Alt], notes)
     if not rows.size:
         return None
     sigma = np.full(len(rows), np.nan)
     accuracy = rows_of(
-        [m for m in found.get("GPA", []) if getattr(m, "I", 0) == 0], lambda m: [time(m), m.HAcc]
+        [m for m in found.get("GPA", []) if getattr(m, "I", 0) == 0], lambda m: [time(m), m.HAcc], notes
     )
     if accuracy.size:
         sigma = np.interp(rows[:, 0], accuracy[:, 0], accuracy[:, 1])
     return Gnss(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], sigma)
 
 
-def _height(found: Messages, time: Clock, odometry: Odometry | None) -> Height | None:
+def _height(found: Messages, time: Clock, odometry: Odometry | None, notes: list[str]) -> Height | None:
     ranges = [
         m for m in found.get("RFND", []) if getattr(m, "Orient", 25) == 25 and getattr(m, "Stat", 4) == 4
     ]
-    rows = rows_of(ranges, lambda m: [time(m), m.Dist if hasattr(m, "Dist") else m.Dist1])
+    rows = rows_of(ranges, lambda m: [time(m), m.Dist if hasattr(m, "Dist") else m.Dist1], notes)
     if rows.size and (rows[:, 1] > 0.0).any():
         return Height(rows[:, 0], rows[:, 1], "ground", "RFND")
     if odometry is not None:

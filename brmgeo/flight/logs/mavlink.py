@@ -18,7 +18,17 @@ from brmgeo.codes import GRAVITY_M_S2
 from brmgeo.errors import FlightError, MissingInputError, one_line
 from brmgeo.extras import extra
 from brmgeo.flight.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, quaternion_from_euler
-from brmgeo.flight.logs.values import Gnss, Height, Log, LogOptions, Orientation, choose, mixed
+from brmgeo.flight.logs.values import (
+    Gnss,
+    Height,
+    Log,
+    LogOptions,
+    Orientation,
+    choose,
+    in_order,
+    mixed,
+    tell_lost,
+)
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 
 Messages = dict[str, list[Any]]
@@ -41,23 +51,27 @@ _TELEMETRY = (
 )
 
 
-def rows_of(messages: list[Any], get: Callable[[Any], list[float]], needed: int | None = None) -> FloatArray:
+def rows_of(
+    messages: list[Any], get: Callable[[Any], list[float]], notes: list[str], needed: int | None = None
+) -> FloatArray:
     """(n, k) rows whose first column, the time, grows and whose first ``needed`` are numbers.
 
-    A message that lacks a field, or has no number in it, is of another version, or damaged, and left out. Of no row at all,
-    (0, 0).
+    A message that lacks a field, or has no number in it, is of another version, or damaged, and left out, which goes to
+    ``notes``. Of no row at all, (0, 0).
     """
     out: list[list[float]] = []
-    last = -np.inf
     for message in messages:
         try:
             row = get(message)
         except (AttributeError, ValueError):
             continue
-        if row[0] > last and all(np.isfinite(v) for v in row[:needed]):
+        if all(np.isfinite(v) for v in row[:needed]):
             out.append(row)
-            last = row[0]
-    return np.array(out, dtype=np.float64) if out else np.empty((0, 0))
+    rows = np.array(out, dtype=np.float64) if out else np.empty((0, 0))
+    rows = rows[in_order(rows[:, 0])] if out else rows
+    if messages:
+        tell_lost(notes, messages[0].get_type(), len(rows), len(messages))
+    return rows
 
 
 def opened(names: tuple[str, ...], log: Any) -> dict[str, list[Any]]:
@@ -110,25 +124,29 @@ def read_telemetry(path: Path, options: LogOptions) -> Log:
     with library(path) as (_, mavutil):
         log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega", notimestamps=False)
         try:
-            found = opened(_TELEMETRY, log)
+            found = opened((*_TELEMETRY, "BAD_DATA"), log)
         finally:
             log.close()
+    unread = [len(message.data) for message in found.pop("BAD_DATA", [])]
     if not found:
         raise FlightError(f"{path}: no MAVLink message of a flight: is it a .tlog, and whole?")
     found, sender = _of_vehicle(found)
-    time = _boot_clock(found)
-    attitude = _attitude(found, time)
-    counts, odometry = _odometry(path, found, time, attitude, options)
+    time, notes = _boot_clock(found), [sender]
+    if unread:
+        notes.append(
+            f"damaged in {len(unread)} pieces: {sum(unread)} bytes could not be read and were passed over"
+        )
+    attitude = _attitude(found, time, notes)
+    counts, odometry = _odometry(path, found, time, attitude, options, notes)
     own = odometry is not None and odometry.source == "LOCAL_POSITION_NED"
-    gnss = _gnss(found, time)
-    notes = [sender]
+    gnss = _gnss(found, time, notes)
     if own:
         notes.append(
             "LOCAL_POSITION_NED is the autopilot's own estimate"
             + (", which GNSS goes into" if gnss is not None else "")
         )
     shots = next((found[n] for n in _TELEMETRY[-3:] if n in found), [])
-    cameras = rows_of(shots, lambda m: [time(m)])
+    cameras = rows_of(shots, lambda m: [time(m)], notes)
     return Log(
         kind="mavlink",
         title="MAVLink telemetry (.tlog)",
@@ -136,8 +154,8 @@ def read_telemetry(path: Path, options: LogOptions) -> Log:
         odometry=odometry,
         uses_gnss=gnss is not None if own else None,
         candidates=counts,
-        imu=_imu(found, time),
-        height=_height(found, time, odometry),
+        imu=_imu(found, time, notes),
+        height=_height(found, time, odometry, notes),
         attitude=attitude,
         gnss=gnss,
         triggers_s=cameras[:, 0] if cameras.size else None,
@@ -175,12 +193,12 @@ def _boot_clock(found: Messages) -> Clock:
     return time
 
 
-def _attitude(found: Messages, time: Clock) -> Orientation | None:
-    euler = rows_of(found.get("ATTITUDE", []), lambda m: [time(m), m.roll, m.pitch, m.yaw])
+def _attitude(found: Messages, time: Clock, notes: list[str]) -> Orientation | None:
+    euler = rows_of(found.get("ATTITUDE", []), lambda m: [time(m), m.roll, m.pitch, m.yaw], notes)
     if euler.size:
         wxyz = enu_flu_from_ned_frd(quaternion_from_euler(*euler[:, 1:4].T))
         return Orientation(euler[:, 0], wxyz, True, "ATTITUDE")
-    rows = rows_of(found.get("ATTITUDE_QUATERNION", []), lambda m: [time(m), m.q1, m.q2, m.q3, m.q4])
+    rows = rows_of(found.get("ATTITUDE_QUATERNION", []), lambda m: [time(m), m.q1, m.q2, m.q3, m.q4], notes)
     if rows.size:
         wxyz = enu_flu_from_ned_frd(rows[:, 1:5])
         return Orientation(rows[:, 0], wxyz, True, "ATTITUDE_QUATERNION")
@@ -188,7 +206,12 @@ def _attitude(found: Messages, time: Clock) -> Orientation | None:
 
 
 def _odometry(
-    path: Path, found: Messages, time: Clock, attitude: Orientation | None, options: LogOptions
+    path: Path,
+    found: Messages,
+    time: Clock,
+    attitude: Orientation | None,
+    options: LogOptions,
+    notes: list[str],
 ) -> tuple[tuple[str, ...], Odometry | None]:
     # The names of every track that is there, and the chosen one. A filter without a position says NaN: then there is no
     # odometry of it.
@@ -196,10 +219,12 @@ def _odometry(
         "VISION_POSITION_ESTIMATE": rows_of(
             found.get("VISION_POSITION_ESTIMATE", []),
             lambda m: [time(m), m.x, m.y, m.z, m.roll, m.pitch, m.yaw, getattr(m, "reset_counter", 0)],
+            notes,
         ),
         "LOCAL_POSITION_NED": rows_of(
             found.get("LOCAL_POSITION_NED", []) if attitude is not None else [],
             lambda m: [time(m), m.x, m.y, m.z],
+            notes,
         ),
     }
     counts = {name: len(rows) for name, rows in tracks.items() if rows.size}
@@ -216,26 +241,27 @@ def _odometry(
     return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream, segment)
 
 
-def _imu(found: Messages, time: Clock) -> Imu | None:
+def _imu(found: Messages, time: Clock, notes: list[str]) -> Imu | None:
     name = next((n for n in ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU") if n in found), None)
     if name is None:
         return None
     # The others tell milliradians and thousandths of g.
     gyro, accel = (1.0, 1.0) if name == "HIGHRES_IMU" else (1e-3, GRAVITY_M_S2 * 1e-3)
-    rows = rows_of(found[name], lambda m: [time(m), m.xgyro, m.ygyro, m.zgyro, m.xacc, m.yacc, m.zacc])
+    rows = rows_of(found[name], lambda m: [time(m), m.xgyro, m.ygyro, m.zgyro, m.xacc, m.yacc, m.zacc], notes)
     if not rows.size:
         return None
     return Imu(rows[:, 0], flu_from_frd(rows[:, 1:4]) * gyro, flu_from_frd(rows[:, 4:7]) * accel)
 
 
-def _height(found: Messages, time: Clock, odometry: Odometry | None) -> Height | None:
+def _height(found: Messages, time: Clock, odometry: Odometry | None, notes: list[str]) -> Height | None:
     down = rows_of(
         [m for m in found.get("DISTANCE_SENSOR", []) if m.orientation == 25],
         lambda m: [time(m), m.current_distance / 100.0],
+        notes,
     )
     if down.size:
         return Height(down[:, 0], down[:, 1], "ground", "DISTANCE_SENSOR")
-    ranges = rows_of(found.get("RANGEFINDER", []), lambda m: [time(m), m.distance])
+    ranges = rows_of(found.get("RANGEFINDER", []), lambda m: [time(m), m.distance], notes)
     if ranges.size and (ranges[:, 1] > 0.0).any():
         return Height(ranges[:, 0], ranges[:, 1], "ground", "RANGEFINDER")
     if odometry is not None:
@@ -243,7 +269,7 @@ def _height(found: Messages, time: Clock, odometry: Odometry | None) -> Height |
     return None
 
 
-def _gnss(found: Messages, time: Clock) -> Gnss | None:
+def _gnss(found: Messages, time: Clock, notes: list[str]) -> Gnss | None:
     rows = rows_of(
         [m for m in found.get("GPS_RAW_INT", []) if m.fix_type >= 3],
         lambda m: [
@@ -253,6 +279,7 @@ def _gnss(found: Messages, time: Clock) -> Gnss | None:
             m.alt * 1e-3,
             (getattr(m, "h_acc", 0) or np.nan) * 1e-3,
         ],
+        notes,
         4,
     )
     return Gnss(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4]) if rows.size else None

@@ -29,7 +29,10 @@ from brmgeo.flight.logs.values import (
     LogOptions,
     Orientation,
     choose,
+    in_order,
     mixed,
+    tell_lost,
+    tell_unread,
     unit,
 )
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
@@ -37,8 +40,8 @@ from brmgeo.flight.readings import FloatArray, Imu, Odometry
 Data = dict[str, Any]
 #: In order of worth to a flight without GNSS: what vision said comes before what the autopilot made of everything.
 _STREAMS = ("vehicle_visual_odometry", "vehicle_odometry", "vehicle_local_position")
-_TYPES = b"BFIMPQALCDSOR"
-_HEADS = {_TYPES[i : i + 1] for i in range(len(_TYPES))}
+_TYPES = b"BFIMPQALDCSOR"
+_DATA = _TYPES[8]
 _DOWN = 25  # ROTATION_PITCH_270 of distance_sensor.orientation
 
 
@@ -54,7 +57,8 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
     if not path.is_file():
         raise MissingInputError(f"{path}: the log is missing")
     said = io.StringIO()
-    whole, unread = _whole_messages(path.read_bytes())
+    data = path.read_bytes()
+    whole, unread, size = *_whole_messages(data), len(data)
     try:
         with contextlib.redirect_stdout(said):  # the library reports damage by printing
             log = ULog(io.BytesIO(whole))
@@ -71,12 +75,7 @@ def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
             f"{path}: the ULog breaks off before its first data: download it from the vehicle again"
         )
     notes: list[str] = []
-    if unread:
-        lost = sum(end - start for start, end in unread)
-        notes.append(
-            f"damaged at {len(unread)} places (first at byte {unread[0][0]}): {lost} of {len(whole) + lost} bytes "
-            "could not be read and were passed over"
-        )
+    tell_unread(notes, unread, size)
     if log.file_corruption or "corrupt" in said.getvalue().lower() or _cut_short(path):
         notes.append("the file is damaged or cut short; what was whole in it was read")
 
@@ -107,9 +106,10 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
     attitude = None
     if "vehicle_attitude" in sets:
         t, wxyz = _attitude(sets["vehicle_attitude"])
+        tell_lost(notes, "vehicle_attitude", len(t), len(sets["vehicle_attitude"]["timestamp"]))
         attitude = Orientation(t, unit(f"{path}: vehicle_attitude", wxyz), True, "vehicle_attitude")
     info = log.msg_info_dict
-    gnss, used_gnss = _gnss(sets), "vehicle_gps_position" in sets or "sensor_gps" in sets
+    gnss, used_gnss = _gnss(sets, notes), "vehicle_gps_position" in sets or "sensor_gps" in sets
     if stream in ("vehicle_odometry", "vehicle_local_position"):
         notes.append(
             f"{stream} is the autopilot's own estimate"
@@ -123,8 +123,8 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
         odometry=odometry,
         uses_gnss=None if stream is None or stream == "vehicle_visual_odometry" else used_gnss,
         candidates=tuple(found),
-        imu=_imu(sets),
-        height=_height(sets, odometry),
+        imu=_imu(sets, notes),
+        height=_height(sets, odometry, notes),
         attitude=attitude,
         gnss=gnss,
         triggers_s=None if triggers is None else _s(triggers),
@@ -136,10 +136,14 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
 
 
 def _whole_messages(data: bytes) -> tuple[bytes, list[tuple[int, int]]]:
-    # The log without what does not lead from one message to the next, and the (start, end) of what was left out: one
-    # wrong length makes the library pass over all that follows. A way is found again where four messages follow each other.
-    def follows(at: int, count: int) -> bool:
-        for _ in range(count):
+    """The log without what does not lead from one message to the next, and the (start, end) of what was left out.
+
+    One wrong length makes the library pass over all that follows. A message counts where another begins at its end, and,
+    of data, where it is as long as others of its topic, or four messages follow. There a way is found again too.
+    """
+
+    def follows(at: int) -> bool:
+        for _ in range(4):
             if at == len(data):
                 return True
             if at + 3 > len(data) or data[at + 2] not in _TYPES:
@@ -149,12 +153,19 @@ def _whole_messages(data: bytes) -> tuple[bytes, list[tuple[int, int]]]:
 
     at, kept, unread = 16, 0, []
     pieces = []
+    lengths: dict[bytes, int] = {}
     while at + 3 <= len(data):
         end = at + 3 + data[at] + 256 * data[at + 1]
-        if data[at + 2] in _TYPES and (end == len(data) or data[end + 2 : end + 3] in _HEADS):
+        topic = data[at + 3 : at + 5] if data[at + 2] == _DATA else b""
+        usual = not topic or lengths.get(topic) == end - at
+        leads = data[at + 2] in _TYPES and (
+            end == len(data) or (end + 2 < len(data) and data[end + 2] in _TYPES)
+        )
+        if leads and (usual or follows(at)):
+            lengths[topic] = end - at
             at = end
             continue
-        again = next((q for q in range(at + 1, len(data) - 3) if follows(q, 4)), None)
+        again = next((q for q in range(at + 1, len(data) - 3) if follows(q)), None)
         if again is None:
             break
         if again != end:
@@ -206,12 +217,6 @@ def _valid(data: Data) -> Any:
     return good & (np.asarray(data["xy_valid"]) != 0) if "xy_valid" in data else good
 
 
-def _increasing(t: FloatArray) -> Any:
-    # Rows that are later than every row before them.
-    before = np.concatenate([[-np.inf], np.maximum.accumulate(t)[:-1]])
-    return t > before
-
-
 def _segments(
     t: FloatArray, data: Data, keep: Any, counters: tuple[str, ...], what: list[tuple[float, str]]
 ) -> Any:
@@ -250,16 +255,13 @@ def _odometry(
             "choose another",
             needs="topic",
         )
-    keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
+    keep[np.flatnonzero(keep)[~in_order(t[keep])]] = False
     t, xyz, q = t[keep], xyz[keep], q[keep]
     resets: list[tuple[float, str]] = []
     segment = _segments(t, data, keep, ("reset_counter",), resets)
     turn = enu_flu_from_ned_frd if ned.all() else flu_flu_from_frd_frd
     xyz = enu_from_ned(xyz) if ned.all() else flu_from_frd(xyz)
-    if not keep.all():
-        notes.append(
-            f"{name}: {int((~keep).sum())} of {len(keep)} rows are not valid or not in order, and left out"
-        )
+    tell_lost(notes, name, len(t), len(keep), "not valid or not in order of time")
     notes.append(f"{name}: pose frame {'NED' if ned.all() else 'FRD (arbitrary heading)'}")
     return Odometry(t, xyz, turn(unit(f"{path}: {name}", q)), name, segment), resets
 
@@ -267,7 +269,7 @@ def _odometry(
 def _attitude(data: Data) -> tuple[FloatArray, FloatArray]:
     t, q = _s(data["timestamp"]), _quaternions(data)
     keep = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
-    keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
+    keep[np.flatnonzero(keep)[~in_order(t[keep])]] = False
     return t[keep], enu_flu_from_ned_frd(q[keep])
 
 
@@ -278,14 +280,11 @@ def _local_position(
     t = _s(data["timestamp"])
     ta, wxyz = _attitude(sets["vehicle_attitude"])
     keep = _valid(data) & (t >= ta[0]) & (t <= ta[-1])
-    keep[np.flatnonzero(keep)[~_increasing(t[keep])]] = False
+    keep[np.flatnonzero(keep)[~in_order(t[keep])]] = False
     t, xyz = t[keep], enu_from_ned(_positions(data)[keep])
     if not len(t):
         raise FlightError(f"{path}: vehicle_local_position has no valid position with an attitude beside it")
-    if not keep.all():
-        notes.append(
-            f"vehicle_local_position: {int((~keep).sum())} of {len(keep)} rows are not valid and left out"
-        )
+    tell_lost(notes, "vehicle_local_position", len(t), len(keep), "not valid or not in order of time")
     resets: list[tuple[float, str]] = []
     counters = ("xy_reset_counter", "z_reset_counter", "heading_reset_counter")
     segment = _segments(t, data, keep, counters, resets)
@@ -294,46 +293,55 @@ def _local_position(
     ), resets
 
 
-def _imu(sets: dict[str, Data]) -> Imu | None:
+def _imu(sets: dict[str, Data], notes: list[str]) -> Imu | None:
     data = sets.get("sensor_combined")
     if data is None or "gyro_rad[0]" not in data:
         return None
     t = _s(data["timestamp"])
-    keep = _increasing(t)
+    keep = in_order(t)
+    tell_lost(notes, "sensor_combined", int(keep.sum()), len(keep))
     gyro = _columns(data, *(f"gyro_rad[{i}]" for i in range(3)))
     accel = _columns(data, *(f"accelerometer_m_s2[{i}]" for i in range(3)))
     return Imu(t[keep], flu_from_frd(gyro[keep]), flu_from_frd(accel[keep]))
 
 
-def _height(sets: dict[str, Data], odometry: Odometry | None) -> Height | None:
+def _height(sets: dict[str, Data], odometry: Odometry | None, notes: list[str]) -> Height | None:
     data = sets.get("distance_sensor")
     if data is not None:
         t, d = _s(data["timestamp"]), np.asarray(data["current_distance"], dtype=np.float64)
-        keep = np.isfinite(d) & (d > np.asarray(data.get("min_distance", 0.0))) & _increasing(t)
+        keep = np.isfinite(d) & (d > np.asarray(data.get("min_distance", 0.0))) & in_order(t)
         if "max_distance" in data:
             keep &= d < np.asarray(data["max_distance"])
         if "orientation" in data and (np.asarray(data["orientation"]) == _DOWN).any():
             keep &= np.asarray(data["orientation"]) == _DOWN
         if "signal_quality" in data:
             keep &= np.asarray(data["signal_quality"]) != 0
+        tell_lost(
+            notes,
+            "distance_sensor",
+            int(keep.sum()),
+            len(keep),
+            "out of its range or order, or not of what is below",
+        )
         if keep.any():
             return Height(t[keep], d[keep], "ground", "distance_sensor")
     data = sets.get("vehicle_local_position")
     if data is not None and np.any(data.get("dist_bottom_valid", 0)):
         t = _s(data["timestamp"])
-        keep = (np.asarray(data["dist_bottom_valid"]) != 0) & _increasing(t)
+        keep = (np.asarray(data["dist_bottom_valid"]) != 0) & in_order(t)
         return Height(t[keep], np.asarray(data["dist_bottom"], np.float64)[keep], "ground", "dist_bottom")
     if odometry is not None:
         return Height(odometry.t_s, odometry.xyz_m[:, 2], "take-off", odometry.source)
     return None
 
 
-def _gnss(sets: dict[str, Data]) -> Gnss | None:
+def _gnss(sets: dict[str, Data], notes: list[str]) -> Gnss | None:
     data = sets.get("vehicle_gps_position", sets.get("sensor_gps"))
     if data is None:
         return None
     t = _s(data["timestamp"])
-    keep = (np.asarray(data["fix_type"]) >= 3) & _increasing(t)
+    keep = (np.asarray(data["fix_type"]) >= 3) & in_order(t)
+    tell_lost(notes, "GNSS", int(keep.sum()), len(keep), "no fix or not in order of time")
     if not keep.any():
         return None
     if "latitude_deg" in data:  # since 1.14

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -187,6 +189,54 @@ def ordered(where: str, t_s: FloatArray, notes: list[str]) -> NDArray[np.int64]:
     if not keep.all():
         notes.append(f"{where}: {int((~keep).sum())} stamps were there twice; the later message counts")
     return np.asarray(order[keep], dtype=np.int64)
+
+
+def in_order(t_s: FloatArray) -> NDArray[np.bool_]:
+    """(n,) bool: rows whose finite times grow. A time that is wrong costs its own row, not all that follow.
+
+    Rows later than all before them; where that leaves out more than need be, the longest chain of growing times (Fredman,
+    "On computing the length of longest increasing subsequences", 1975).
+    """
+    t = np.where(np.isfinite(t_s), t_s, -np.inf)
+    plain = t > np.concatenate([[-np.inf], np.maximum.accumulate(t)[:-1]])
+    if plain.all():
+        return plain
+    ends: list[float] = []
+    rows: list[int] = []
+    before = np.full(len(t), -1, dtype=np.int64)
+    for i, value in enumerate(t.tolist()):
+        if value == -math.inf:
+            continue
+        k = bisect_left(ends, value)
+        before[i] = rows[k - 1] if k else -1
+        ends[k : k + 1], rows[k : k + 1] = [value], [i]
+    if len(ends) <= plain.sum():
+        return plain
+    chain = np.zeros(len(t), dtype=np.bool_)
+    row = rows[-1]
+    while row >= 0:
+        chain[row] = True
+        row = int(before[row])
+    return chain
+
+
+def tell_lost(
+    notes: list[str], name: str, kept: int, of: int, why: str = "not numbers or not in order of time"
+) -> None:
+    """Notes how many of a stream's rows were left out, where there were such."""
+    if kept < of:
+        notes.append(f"{name}: {of - kept} of {of} rows ({(of - kept) / of:.1%}) are {why}, and left out")
+
+
+def tell_unread(notes: list[str], unread: Sequence[tuple[int, int]], size: int) -> None:
+    """Notes the parts (first byte, byte after the last) of a file that could not be read, where there were such."""
+    if unread:
+        lost = sum(end - start for start, end in unread)
+        places = f"{len(unread)} places, the first" if len(unread) > 1 else "one place,"
+        notes.append(
+            f"damaged at {places} at byte {unread[0][0]}: {lost} of {size} bytes ({lost / size:.2%}) could not be read and "
+            "were passed over"
+        )
 
 
 def unit(where: str, wxyz: FloatArray) -> FloatArray:
