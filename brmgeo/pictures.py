@@ -68,7 +68,9 @@ def _jpeg(data: bytes, name: str, flags: int) -> NDArray[Any] | None:
         if colours not in ("Gray", "YCbCr", "RGB") or flags not in _JPEG_FLAGS:
             return None
         grey = flags == cv2.IMREAD_GRAYSCALE or (flags == cv2.IMREAD_UNCHANGED and colours == "Gray")
-        image = simplejpeg.decode_jpeg(data, colorspace="GRAY" if grey else "RGB", strict=True)
+        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(
+            data, colorspace="GRAY" if grey else "RGB", strict=True
+        )
     except ValueError as error:
         raise _faulty(name, f"damaged or cut short ({one_line(error, 120)})") from None
     return image[:, :, 0] if grey else image

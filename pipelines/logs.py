@@ -80,6 +80,10 @@ def inspect_document(paths: Sequence[Path], options: LogOptions | None = None) -
         "parameter that mends it: an option of that name (`--body` for `body_deg`). A log without",
         "pictures takes them from `--photos` (by its camera triggers) or `--video`.",
         "",
+        "What a damaged log lost is noted: bytes that lead to no message, rows whose time or numbers cannot be. What one",
+        "flipped bit makes of a number in a message without a checksum (ULog, .bin) looks like any other number: that",
+        "cannot be found.",
+        "",
     ]
     others = []
     for path in paths:

@@ -14,7 +14,7 @@ import shapely
 from pyproj import CRS
 
 from brmgeo.errors import CrsError, InputError, MissingInputError, SettingsError, one_line
-from brmgeo.files import plain_cell, read_json, write_bytes
+from brmgeo.files import clear_scratch, plain_cell, read_json, write_bytes
 from brmgeo.geo.crs import LONLAT, parse_crs
 from brmgeo.geo.formats import vector_file
 
@@ -82,6 +82,7 @@ def export_results(results: Path, what: str, out: Path, crs: str | None) -> str:
         buffer = io.BytesIO()
         pyogrio.write_dataframe(frame, buffer, layer=what, driver=driver)
         data = buffer.getvalue()
+    clear_scratch(out.absolute().parent)
     write_bytes(out, data)
     return f"wrote {out}: {what}, {len(frame)} points, {frame.crs.name}"
 

@@ -287,7 +287,7 @@ class Segmenter:
 
             # An .onnx of it, made where torch is installed, runs without.
             network, card = load_network(tensors)
-            runs = _TorchNetwork(network, card.temperature, threads, path)
+            runs = _TorchNetwork(network, card.temperature, threads, tensors)
             return cls(card, "torch", tensors, runs, card.looks if looks is None else looks)
         if not graph.is_file():
             raise MissingInputError(

@@ -222,7 +222,7 @@ class Store:
         return Artifact(step, step.path, facts, record, fresh=True)
 
     def _record(self, step: Step[Any]) -> Json | None:
-        record = files.read_json(step.path / RECORD)
+        record: Json = files.read_json(step.path / RECORD)
         return record if _is_whole(record) and record["key"] == step.key else None
 
     def _damage(self, step: Step[Any], record: Json) -> str | None:

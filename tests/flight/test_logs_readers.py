@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from log_writers import (
     ACCEL,
     GYRO,
@@ -27,6 +31,7 @@ from log_writers import (
 
 from brmgeo.errors import FlightError, InputError, MissingExtraError, MissingInputError
 from brmgeo.flight.logs import Log, LogOptions, kind_of, read_log
+from brmgeo.flight.logs.values import in_order
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 
 pytest.importorskip("rosbags")
@@ -337,3 +342,46 @@ def test_a_wrong_length_in_a_ulog_costs_the_messages_beside_it_and_is_told() -> 
     whole, unread = _whole_messages(bytes(data))
     assert unread == [(16 + 20 * 7, 16 + 21 * 7)]
     assert whole == b"\0" * 16 + message * 49
+
+
+def _rows(log: Log) -> dict[str, int]:
+    streams = {"odometry": log.odometry, "imu": log.imu, "height": log.height, "attitude": log.attitude}
+    return {name: 0 if stream is None else len(stream.t_s) for name, stream in streams.items()}
+
+
+@pytest.mark.parametrize("make", [px4, dataflash])
+def test_one_flipped_bit_costs_a_row_or_two_and_whatever_it_costs_is_told(
+    make: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    """Behind the definitions, which stand first."""
+    path = make(tmp_path / ("a.ulg" if make is px4 else "a.bin"))
+    data, whole = path.read_bytes(), read_log(path)
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        damaged = bytearray(data)
+        damaged[rng.integers(len(data) // 3, len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        got = read_log(path)
+        lost = {name: n - _rows(got)[name] for name, n in _rows(whole).items() if _rows(got)[name] != n}
+        assert all(n <= 3 for n in lost.values()), lost
+        assert not lost or set(got.notes) - set(whole.notes), lost
+
+
+def test_a_wrong_time_costs_its_own_row() -> None:
+    t = np.arange(20.0)
+    assert in_order(t).all()
+    for wrong in (1e9, -5.0, math.nan):
+        t[3] = wrong
+        assert in_order(t).tolist() == [i != 3 for i in range(20)]
+    assert in_order(np.array([0.0, 1.0, 1.0, 2.0])).tolist() == [True, True, False, True]
+    assert not in_order(np.array([math.nan])).any()
+
+
+@given(st.lists(st.integers(0, 12), max_size=14))
+def test_no_longer_chain_of_times_is_there(times: list[int]) -> None:
+    kept = in_order(np.array(times, np.float64))
+    assert (np.diff(np.array(times)[kept]) > 0).all()
+    longest = [0] * len(times)
+    for i, t in enumerate(times):
+        longest[i] = 1 + max((longest[k] for k in range(i) if times[k] < t), default=0)
+    assert kept.sum() == max(longest, default=0)

@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 from small_flights import command
 
 from brmgeo import files
+from brmgeo.errors import WorkflowError
 from brmgeo.flight.folder import Flight, read_flight
 from brmgeo.flight.motion import motions
 from brmgeo.flight.own import Embedded
@@ -227,12 +228,12 @@ def test_a_thinned_flight_is_there_whole_or_not_at_all(folder: Path, monkeypatch
     def full(source: Path, target: Path) -> None:
         if str(target).endswith("f2.png"):
             raise OSError(28, "No space left on device", str(target))
-        copy2(source, target)
+        copyfile(source, target)
 
-    copy2 = shutil.copy2
+    copyfile = shutil.copyfile
     with monkeypatch.context() as context:
-        context.setattr(shutil, "copy2", full)
-        with pytest.raises(OSError, match="No space"):
+        context.setattr(shutil, "copyfile", full)
+        with pytest.raises(WorkflowError, match="the disk is full"):
             odometry.thin_flight(folder, out, 2.0)
     assert sorted(p.name for p in folder.parent.iterdir()) == ["flight"]
     odometry.thin_flight(folder, out, 2.0)

@@ -290,7 +290,7 @@ def test_rasters_that_cannot_be_are_refused_in_one_line(
         "cut.tif": ((), "cut.tif"),
         "large.tif": ((), "large.tif: damaged or cut short"),
         "frame.jpg": ((), "such as a frame: give the folder that holds it"),
-        "text.tif": ((), "not a readable raster"),
+        "text.tif": ((), "not a readable image or raster"),
         "whole.tif": (("--bands", "1,2,9"), "has bands 1 to 3 (--bands"),
     }
     for name, (words, said) in cases.items():

@@ -572,7 +572,7 @@ def test_pairs_left_out_are_counted_by_reason(pairs: tuple[Path, Path], capsys: 
     assert "no tile is left: 7 without building, 1 unknown; --empty-share 1 keeps them" in error
     assert make(capsys, pairs, "--empty-share", "1").status == 0
     assert len(read_tiles(pairs[0].parent / "out")) == 7
-    assert "no share of the tiles" in make(capsys, pairs, "--empty-share", "nan").error
+    assert "give finite numbers" in make(capsys, pairs, "--empty-share", "nan").error
 
 
 def test_pictures_of_a_flight_are_for_testing_only(pairs: tuple[Path, Path], capsys: Capture) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from brmgeo.files import WRITTEN
 from brmgeo.segment import finish as ending
 from brmgeo.segment.finish import licence_of, score
 from brmgeo.segment.ground import ScoredFrame
@@ -137,7 +138,9 @@ def test_a_run_that_ends_while_it_finishes_leaves_the_weights_of_before(
     (tmp_path / "metrics.json").write_text("of earlier weights")
     run(2)
     before = files()
-    assert set(before) == {"model.safetensors", "model.md", "model.onnx", "reliability.png"}
+    assert set(before) == {
+        "model.safetensors", "model.md", "model.onnx", "reliability.png", "metrics.edited.json", WRITTEN,
+    }  # fmt: skip
     assert not [p for p in tmp_path.iterdir() if p.is_dir()]
     monkeypatch.setattr(ending, "score", killed)
     with pytest.raises(KeyboardInterrupt):

@@ -28,6 +28,7 @@ from brmgeo.flight.logs.values import (
     Log,
     LogOptions,
     Orientation,
+    are_turns,
     choose,
     in_order,
     mixed,
@@ -240,7 +241,7 @@ def _odometry(
 ) -> tuple[Odometry, list[tuple[float, str]]]:
     xyz, q = _positions(data), _quaternions(data)
     t = _s(data["timestamp_sample"] if np.any(data.get("timestamp_sample", 0)) else data["timestamp"])
-    keep = np.isfinite(xyz).all(axis=1) & np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
+    keep = np.isfinite(xyz).all(axis=1) & are_turns(q)
     if "pose_frame" in data:  # since 1.14: 0 unknown, 1 NED, 2 FRD
         frame = np.asarray(data["pose_frame"])[keep]
         ned, frd = frame == 1, frame == 2
@@ -268,7 +269,7 @@ def _odometry(
 
 def _attitude(data: Data) -> tuple[FloatArray, FloatArray]:
     t, q = _s(data["timestamp"]), _quaternions(data)
-    keep = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
+    keep = are_turns(q)
     keep[np.flatnonzero(keep)[~in_order(t[keep])]] = False
     return t[keep], enu_flu_from_ned_frd(q[keep])
 
