@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import InputError
-from brmgeo.files import whole_files, whole_folder
+from brmgeo.files import digest, whole_files, whole_folder
 from brmgeo.flight.folder import MADE_BY, is_own_odometry, read_flight
 from brmgeo.flight.own import OdometryMethod, estimate, thinned_rows
 from brmgeo.flight.write import copy_thinned, name_track, rounded_track, write_facts, write_track
@@ -48,8 +48,10 @@ def make_odometry(flight_dir: Path, method: OdometryMethod = "auto") -> dict[str
     track = replace(track, wxyz=np.round(track.wxyz, 9))
     names = (f"{stem}.json", facts["track"], facts["covariance"])
     with whole_files(flight_dir, names, Progress().say) as work:
-        write_facts(work, stem, facts)
         section = write_track(work, track, stem=stem, columns=columns)
+        # A run that is killed between the two leaves a new track beside old covariance: whoever reads them can tell.
+        facts["sha256"] = {name: digest(work / name) for name in names[1:]}
+        write_facts(work, stem, facts)
     name_track(flight_dir, section, MADE_BY)
     return facts
 

@@ -20,7 +20,7 @@ from PIL import Image, UnidentifiedImageError
 
 from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError
-from brmgeo.files import json_of
+from brmgeo.files import digest, json_of, read_json
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
@@ -650,6 +650,17 @@ def _covariance(path: Path, odometry: Odometry) -> Odometry:
             f"{len(times)} rows that do not belong to the {len(odometry.t_s)} poses of {odometry.source}: "
             "make both together, or remove 'covariance' from [odometry]",
         )
+    facts = read_json(path.with_name("odometry.json"))
+    made = facts.get("sha256") if isinstance(facts, dict) else None
+    track = path.with_name(odometry.source)
+    if isinstance(made, dict) and track.is_file() and made.get(track.name) == digest(track):
+        if made.get(path.name) != digest(path):
+            raise refuse(
+                path,
+                None,
+                None,
+                f"is of another run than {track.name}: make both together again, or remove 'covariance'",
+            )
     walk = table.numbers["walk_m2"]
     falling = np.flatnonzero(np.diff(walk, prepend=0.0) < 0.0)
     if falling.size:

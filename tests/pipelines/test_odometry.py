@@ -51,6 +51,13 @@ def test_a_flight_without_odometry_gets_one(folder: Path, tmp_path: Path) -> Non
     assert (folder / "odometry.tum").read_text() == made
     assert (folder / "odometry.edited.tum").read_text() == f"# mine\n{made}"
     (folder / "odometry.edited.tum").unlink()
+    # What a run leaves that is killed before the covariance of its track is there.
+    beside = folder / "odometry.covariance.csv"
+    kept = beside.read_text()
+    beside.write_text(f"{kept}\n")
+    with pytest.raises(FlightError, match=r"covariance\.csv: is of another run than odometry\.tum"):
+        read_flight(folder)
+    beside.write_text(kept)
 
     (folder / "imu.csv").chmod(0o666)
     thin = thin_flight(folder, tmp_path / "thin", 5.0)
