@@ -653,14 +653,19 @@ def _covariance(path: Path, odometry: Odometry) -> Odometry:
     facts = read_json(path.with_name("odometry.json"))
     made = facts.get("sha256") if isinstance(facts, dict) else None
     track = path.with_name(odometry.source)
-    if isinstance(made, dict) and track.is_file() and made.get(track.name) == digest(track):
-        if made.get(path.name) != digest(path):
-            raise refuse(
-                path,
-                None,
-                None,
-                f"is of another run than {track.name}: make both together again, or remove 'covariance'",
-            )
+    # What a run leaves that was killed between the two.
+    if (
+        isinstance(made, dict)
+        and track.is_file()
+        and made.get(track.name) == digest(track)
+        and made.get(path.name) != digest(path)
+    ):
+        raise refuse(
+            path,
+            None,
+            None,
+            f"is of another run than {track.name}: make both together again, or remove 'covariance'",
+        )
     walk = table.numbers["walk_m2"]
     falling = np.flatnonzero(np.diff(walk, prepend=0.0) < 0.0)
     if falling.size:

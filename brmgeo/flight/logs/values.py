@@ -240,11 +240,11 @@ def tell_unread(notes: list[str], unread: Sequence[tuple[int, int]], size: int) 
 
 
 def are_turns(wxyz: FloatArray) -> NDArray[np.bool_]:
-    """(n,) bool: quaternions (n, 4) of a length near 1; where over one in fifty has another, those with any (see ``unit``)."""
+    """(n,) bool: quaternions (n, 4) of a length near 1; where over one in fifty has another, all with one (see ``unit``)."""
     length = np.linalg.norm(wxyz, axis=1)
     there = np.isfinite(length) & (length > 0.5)
     near = there & (np.abs(length - 1.0) < 0.01)
-    return near if near.sum() >= 0.98 * there.sum() else there
+    return np.asarray(near if near.sum() >= 0.98 * there.sum() else there)
 
 
 def unit(where: str, wxyz: FloatArray) -> FloatArray:
