@@ -18,7 +18,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,11 @@ from brmgeo.workflow.stage import Map, R, T
 
 _MEMORY_SHARE = 0.7
 _LONGEST_GREETING = 1 << 20
+#: How many threads libraries take.
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+#: Loggers whose warnings go to a file, and how.
+_LOGGERS = ("distributed", "distributed.client", "tornado", "bokeh")
+_LOG_FORMAT = "%(asctime)s %(process)d %(name)s %(levelname)s %(message)s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,16 +241,14 @@ class _Dask:
         workers = self._workers or CPU_COUNT
         memory = int(min(virtual_memory().available, MEMORY_LIMIT) * _MEMORY_SHARE / workers)
         # Each worker is one of several on this machine: its libraries must not take all the cores for themselves.
-        threads = {
-            "NUMBA_NUM_THREADS": "1",
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-            "MKL_NUM_THREADS": "1",
-        }
+        environment = {name: os.environ.get(name, "1") for name in _THREADS}
+        # Dask reads it in a worker's first moment, before any plugin, and in that of one started anew.
+        environment["DASK_LOGGING"] = repr(_logging_to(self._log))
+        self._stack.enter_context(_environment(environment))  # Dask sets it in this process too, for good
         scratch = self._stack.enter_context(files.scratch_folder("dask"))
         self._stack.enter_context(
             dask.config.set(
-                {"distributed.nanny.pre-spawn-environ": threads, "temporary-directory": str(scratch)}
+                {"distributed.nanny.pre-spawn-environ": environment, "temporary-directory": str(scratch)}
             )
         )
         self._stack.enter_context(_logs_to(self._log))
@@ -272,7 +275,7 @@ class _Dask:
                 f"the local Dask cluster does not start ({error}); run with the scheduler 'serial'{self._see}",
                 needs="scheduler",
             ) from error
-        client.register_plugin(_quiet_worker(self._log))
+        client.register_plugin(_steady_worker())
         where = (
             f"dashboard {cluster.dashboard_link}"
             if _has_dashboard()
@@ -369,48 +372,69 @@ def look_around(token: str) -> tuple[bool, str]:
     return os.path.exists(token), _house()
 
 
-def _quiet_worker(log: Path | None) -> Any:
-    """A worker plugin, so that restarted workers have it too: Dask's warnings go to a file, or nowhere, and
-    Ctrl-C is for the run alone, which then ends its workers."""
+@contextlib.contextmanager
+def _environment(own: Mapping[str, str]) -> Iterator[None]:
+    """``own`` stands in this process's environment while the body runs, and what stood there before stands there after."""
+    before = {name: os.environ.get(name) for name in own}
+    os.environ.update(own)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _steady_worker() -> Any:
+    """A worker plugin, so that restarted workers have it too: Ctrl-C is for the run alone, which then ends its workers."""
     from distributed import WorkerPlugin
 
-    class QuietWorker(WorkerPlugin):  # type: ignore[misc,unused-ignore]
-        name = "brmgeo-quiet"
+    class SteadyWorker(WorkerPlugin):  # type: ignore[misc,unused-ignore]
+        name = "brmgeo-steady"
 
         def setup(self, worker: Any) -> None:
-            _redirect(log)
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    return QuietWorker()
+    return SteadyWorker()
+
+
+def _logging_to(path: Path | None) -> dict[str, Any]:
+    """Settings of ``logging`` under which warnings of Dask and Tornado go to ``path``, or nowhere."""
+    nowhere: dict[str, Any] = {"class": "logging.NullHandler"}
+    file = {"class": "logging.FileHandler", "filename": str(path), "delay": True, "formatter": "line"}
+    quiet = {"level": "WARNING", "handlers": ["file"], "propagate": False}
+    return {
+        "version": 1,
+        "disable_existing_loggers": False,
+        "formatters": {"line": {"format": _LOG_FORMAT}},
+        "handlers": {"file": file if path else nowhere},
+        "loggers": dict.fromkeys(_LOGGERS, quiet),
+    }
 
 
 @contextlib.contextmanager
 def _logs_to(path: Path | None) -> Iterator[None]:
-    """Dask's and Tornado's warnings go to ``path``, or nowhere, while the body runs."""
-    before = _redirect(path)
-    try:
-        yield
-    finally:
-        for logger, handlers, level, propagate in before:
-            for handler in logger.handlers:
-                handler.close()
-            logger.handlers, logger.propagate = handlers, propagate
-            logger.setLevel(level)
-
-
-def _redirect(path: Path | None) -> list[tuple[logging.Logger, list[logging.Handler], int, bool]]:
+    """Dask's and Tornado's warnings of this process go to ``path``, or nowhere, while the body runs."""
     import distributed  # noqa: F401  # it sets up its loggers when imported, and would undo this later
 
-    before = []
-    for name in ("distributed", "distributed.client", "tornado", "bokeh"):
-        logger = logging.getLogger(name)
-        before.append((logger, logger.handlers, logger.level, logger.propagate))
-        handler = logging.FileHandler(path, delay=True) if path else logging.NullHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(process)d %(name)s %(levelname)s %(message)s"))
-        logger.handlers, logger.propagate = [handler], False
-        logger.setLevel(logging.WARNING)
-    return before
+    with contextlib.ExitStack() as stack:
+        for name in _LOGGERS:
+            logger = logging.getLogger(name)
+            stack.callback(_restore, logger, logger.handlers, logger.level, logger.propagate)
+            handler = logging.FileHandler(path, delay=True) if path else logging.NullHandler()
+            stack.callback(handler.close)
+            handler.setFormatter(logging.Formatter(_LOG_FORMAT))
+            logger.handlers, logger.propagate = [handler], False
+            logger.setLevel(logging.WARNING)
+        yield
+
+
+def _restore(logger: logging.Logger, handlers: list[logging.Handler], level: int, propagate: bool) -> None:
+    logger.handlers, logger.propagate = handlers, propagate
+    logger.setLevel(level)
 
 
 def _has_dashboard() -> bool:

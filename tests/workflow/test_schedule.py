@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import dask
 import numpy as np
 import psutil
 import pytest
@@ -122,6 +123,21 @@ def test_an_item_that_kills_every_worker_is_one_line(
     assert "\n" not in str(error.value)
     assert list(two_workers(toys.square, range(8))) == [x * x for x in range(8)]
     assert capfd.readouterr() == ("", "")  # Dask's warnings went to the log
+
+
+def test_a_worker_speaks_to_the_log_from_its_first_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    before = dict(os.environ)
+    early = "import logging; logging.getLogger('distributed.diskutils').error('said before any plugin')"
+    with (
+        dask.config.set({"distributed.worker.preload": [early]}),
+        scheduler(None, log=tmp_path / "dask.log", workers=1) as map,
+    ):
+        assert list(map(toys.square, range(2))) == [0, 1]
+    assert os.environ == before
+    assert "said before any plugin" in (tmp_path / "dask.log").read_text()
+    assert capfd.readouterr() == ("", "")
 
 
 def test_dask_speaks_to_its_log_only(two_workers: Map, tmp_path_factory: pytest.TempPathFactory) -> None:
