@@ -1106,7 +1106,9 @@ def odometry(flight: Path, method: str, thin: Path | None, every_s: float) -> No
 def main() -> None:
     """Entry point of the ``brmgeo`` command."""
     clean_up_when_told_to_end()
-    sys.exit(last_door(lambda: cli(standalone_mode=False), sys.argv[1:]))
+    status = last_door(lambda: cli(standalone_mode=False), sys.argv[1:])
+    # A library's callback may pass over what was raised in it, and the run go on to its end.
+    sys.exit(128 + _ended[0] if _ended and status == 0 else status)
 
 
 def last_door(command: Callable[[], Any], words: Sequence[str]) -> int:
@@ -1137,8 +1139,12 @@ def last_door(command: Callable[[], Any], words: Sequence[str]) -> int:
 _INTERRUPTED = "brmgeo: interrupted; what was finished is kept, the next run goes on from there"
 
 
+_ended: list[int] = []
+
+
 def _end(number: int, frame: object) -> None:
     signal.signal(number, signal.SIG_DFL)  # a second one does not wait for what is tidied up
+    _ended.append(number)
     raise SystemExit(128 + number)
 
 

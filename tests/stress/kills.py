@@ -27,10 +27,12 @@ from arena import ROOT
 from small_maps import make_source
 from small_recipes import TINY
 
+from brmgeo.files import WRITTEN
+
 END_S = 30.0
 # These tell how long things took, or how far a run has come.
 TIMED = {"report.html", "metrics.json", "flights.csv", "summary.md"}
-PROGRESS = {"masks.json"}
+PROGRESS = {"masks.json", WRITTEN}
 
 
 @dataclass(frozen=True)
