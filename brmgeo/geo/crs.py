@@ -11,6 +11,7 @@ from functools import lru_cache
 
 from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError as ProjCrsError
+from pyproj.exceptions import ProjError
 
 from brmgeo.errors import CrsError
 from brmgeo.geo.grid import Bounds
@@ -44,8 +45,16 @@ def parse_crs(crs: str) -> CRS:
 
 @lru_cache(maxsize=256)
 def transformer(src: str, dst: str) -> Transformer:
-    """The transformation from ``src`` to ``dst``, x (easting, longitude) first; cached. CrsError for an unknown CRS."""
-    return Transformer.from_crs(parse_crs(src), parse_crs(dst), always_xy=True)
+    """The transformation from ``src`` to ``dst``, x (easting, longitude) first; cached.
+
+    CrsError for an unknown CRS, and where none leads to the other: one that is local, or whose definition is damaged.
+    """
+    try:
+        return Transformer.from_crs(parse_crs(src), parse_crs(dst), always_xy=True)
+    except ProjError as error:
+        raise CrsError(
+            f"no transformation leads from {_short(crs_name(src))} to {_short(crs_name(dst))}: state the crs of the data"
+        ) from error
 
 
 def transform_bounds(src: str, dst: str, bounds: Bounds, densify: int = 21) -> Bounds:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from brmgeo.errors import MissingInputError
+from brmgeo.errors import InputError, MissingInputError
 from brmgeo.flight.readings import Camera, FloatArray
 from brmgeo.geo.formats import vector_file
 from brmgeo.geo.grid import Bounds
@@ -31,6 +31,8 @@ from brmgeo.synth.flight import (
 #: Paths that have a name; others are GeoJSON files.
 PATHS = ("rectangle", "lawnmower", "random")
 _FLOOR_M = 3.0
+#: A waypoint farther off the maps than this is a wrong one.
+_FAR_M = 20_000.0
 
 
 class FineImagery(Protocol):
@@ -68,8 +70,8 @@ def simulator_settings(own: FlightSettings, **changes: Any) -> SimulationSetting
 def flight_path(path: str, ground: RaisedFootprints, seed: int, bounds: Bounds, crs: str) -> FloatArray:
     """(n, 2) waypoints in ``crs``: one of ``PATHS`` placed over built-up ground by the seed, or the line of a GeoJSON file.
 
-    Raises MissingInputError for what is neither, InputError for a shape that does not fit into the bounds or a file that
-    holds no line.
+    Raises MissingInputError for what is neither, InputError for a shape that does not fit into the bounds, a file that
+    holds no line, or one that leads more than 20 km away from them.
     """
     if path == "rectangle":
         return place(rectangle((0.0, 0.0), 0.0), ground, seed, bounds)
@@ -81,7 +83,13 @@ def flight_path(path: str, ground: RaisedFootprints, seed: int, bounds: Bounds, 
         raise MissingInputError(
             f"path {path}: give {', '.join(PATHS)}, or a GeoJSON file with a LineString", needs="path"
         )
-    return path_from_geojson(path, crs)
+    route = path_from_geojson(path, crs)
+    away = np.maximum(np.array(bounds[:2]) - route, route - np.array(bounds[2:])).max(axis=1)
+    if not away.max() <= _FAR_M:
+        raise InputError(
+            f"{path}: waypoint {int(away.argmax()) + 1} lies {away.max() / 1000.0:.0f} km off the maps: correct it"
+        )
+    return route
 
 
 def path_name(path: str) -> str:

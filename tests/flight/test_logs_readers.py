@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -91,6 +92,21 @@ def test_a_bag_file_inside_its_folder_is_the_bag(tmp_path: Path) -> None:
     folder = bag(tmp_path / "other", "mcap", topics=("pose",))
     check_track(read_log(next(folder.glob("*.mcap"))))
     assert np.array_equal(read_odometry(folder, "rosbag").t_s, read_log(folder).odometry.t_s)  # type: ignore[union-attr]
+
+
+def test_messages_that_a_bag_counts_and_does_not_hold_are_told(tmp_path: Path) -> None:
+    folder = bag(tmp_path / "flight", "mcap", topics=("odom", "imu"))
+    file = next(folder.glob("*.mcap"))
+    whole = read_log(file)
+    assert not [note for note in whole.notes if "left out" in note]
+    data = file.read_bytes()
+    # The count of one topic in the bag's statistics: a channel's number, then its messages.
+    count = struct.pack("<Q", len(T))
+    at = data.rindex(count)
+    file.write_bytes(data[:at] + struct.pack("<Q", 4 * len(T)) + data[at + 8 :])
+    told = [note for note in read_log(file).notes if "left out" in note]
+    assert len(told) == 1
+    assert f"{3 * len(T)} of {4 * len(T)} rows (75.0%) are counted by the bag but not found in it" in told[0]
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "mono8", "jpeg"])

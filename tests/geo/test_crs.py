@@ -114,3 +114,9 @@ def test_names_and_equality():
     assert not same_crs("EPSG:5187", "EPSG:5186")
     with pytest.raises(CrsError, match="is not known"):
         transformer("EPSG:99999999", LONLAT)
+
+
+def test_no_way_between_two_crs_is_one_line():
+    here = 'LOCAL_CS["site grid",UNIT["metre",1]]'
+    with pytest.raises(CrsError, match="no transformation leads from site grid to EPSG:5187: state the crs"):
+        transformer(here, "EPSG:5187")

@@ -58,6 +58,14 @@ def test_a_path_that_nobody_knows_names_its_parameter(ground: RaisedFootprints) 
     assert (path_name("random"), path_name("a/line.geojson")) == ("random", "line")
 
 
+def test_a_waypoint_far_off_the_maps_is_told(ground: RaisedFootprints, tmp_path: Path) -> None:
+    line = tmp_path / "line.geojson"
+    line.write_text('{"type": "LineString", "coordinates": [[129.0, 38.0], [129.001, 38.0], [29.0, 38.0]]}')
+    bounds = (199_000.0, 599_000.0, 201_000.0, 601_000.0)
+    with pytest.raises(InputError, match=r"line.geojson: waypoint 3 lies \d+ km off the maps: correct it"):
+        flight_path(str(line), ground, 1, bounds, "EPSG:5187")
+
+
 def test_bounds_are_never_drawn_in_to_nothing() -> None:
     assert inset((0.0, 0.0, 1000.0, 800.0), 100.0) == (100.0, 100.0, 900.0, 700.0)
     assert inset((0.0, 0.0, 200.0, 1000.0), 100.0) == (50.0, 50.0, 150.0, 950.0)

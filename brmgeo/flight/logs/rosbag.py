@@ -6,6 +6,7 @@ that were not set together. Body frames are FLU by REP-103 and taken as they are
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from brmgeo.flight.logs.values import (
     Orientation,
     choose,
     ordered,
+    tell_lost,
     unit,
 )
 from brmgeo.flight.readings import Camera, FloatArray, Imu, Odometry
@@ -165,8 +167,13 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
         got = _Gathered(path, topics, notes)
         taken = topics.taken
         connections = [c for c in reader.connections if c.topic in taken]
+        read: Counter[str] = Counter()
         for connection, recorded, raw in reader.messages(connections=connections) if connections else ():
+            read[connection.topic] += 1
             got.take(connection.topic, reader.deserialize(raw, connection.msgtype), recorded)
+        for topic in sorted({c.topic for c in connections}):
+            counted = sum(c.msgcount for c in connections if c.topic == topic)
+            tell_lost(notes, topic, read[topic], counted, "counted by the bag but not found in it")
         title = f"ROS {'2' if reader.is2 else '1'} bag, {len({c.topic for c in reader.connections})} topics"
         record_start = reader.start_time * 1e-9
     return _normal(path, got, title, record_start)
