@@ -413,6 +413,11 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
                 frame = pyogrio.read_dataframe(
                     vector_file(whole), layer=layer, encoding=encoding, on_invalid="ignore"
                 )
+                if suffix == ".fgb" and len(frame) < (counted := pyogrio.read_info(whole)["features"]):
+                    raise InputError(
+                        f"{path.name}: cut short or damaged: {len(frame)} of its {counted} features are there: "
+                        "fetch the file again"
+                    )
     except InputError:
         raise
     except Exception as error:  # GDAL, pyarrow and geopandas raise many kinds on damaged files
