@@ -477,9 +477,10 @@ _HELD = ".brmgeo-scratch"
 def scratch_folder(what: str) -> Iterator[Path]:
     """A folder of this process's own in the system's temporary folder, ``brmgeo-WHAT-...``; removed at the end.
 
-    Folders of the same user's runs that were killed are removed first: nobody holds the lock in them any more.
+    Folders of the same user's runs that were killed are removed before and after: nobody holds the lock in them any more.
     """
-    _sweep(Path(tempfile.gettempdir()))
+    temporary = Path(tempfile.gettempdir())
+    _sweep(temporary)
     while True:
         folder = Path(tempfile.mkdtemp(prefix=f"brmgeo-{what}-"))
         lock = open_lock(folder / _HELD)
@@ -491,9 +492,11 @@ def scratch_folder(what: str) -> Iterator[Path]:
         with _placed(folder, folder):
             yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _clear(folder)
         os.close(lock)
-        shutil.rmtree(folder, ignore_errors=True)  # Windows keeps a lock file as long as it is open
+        _clear(folder)  # Windows keeps a lock file as long as it is open
+        # Workers of a killed run may have outlived it when this one began.
+        _sweep(temporary)
 
 
 def _sweep(temporary: Path) -> None:
@@ -505,9 +508,22 @@ def _sweep(temporary: Path) -> None:
             lock = os.open(folder / _HELD, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
             try:
                 if take_lock(lock, wait=False):
-                    shutil.rmtree(folder, ignore_errors=True)
+                    _clear(folder)
             finally:
                 os.close(lock)
+
+
+def _clear(folder: Path) -> None:
+    """Removes a scratch folder, its lock last: one that a process still writes into is swept again another time."""
+    with contextlib.suppress(OSError):
+        for path in list(folder.iterdir()):
+            if path.name != _HELD:
+                shutil.rmtree(
+                    path, ignore_errors=True
+                ) if path.is_dir() and not path.is_symlink() else path.unlink()
+        if [path.name for path in folder.iterdir()] in ([_HELD], []):
+            (folder / _HELD).unlink(missing_ok=True)
+            folder.rmdir()
 
 
 # --- contents ----------------------------------------------------------------------------------------------------

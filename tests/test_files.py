@@ -361,6 +361,28 @@ def test_scratch_of_killed_runs_goes_with_the_next(tmp_path: Path, monkeypatch: 
     assert (elsewhere / ".brmgeo-scratch").exists()
 
 
+def test_scratch_that_workers_still_wrote_into_goes_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    left = tmp_path / "brmgeo-dask-abc"
+    sweep = shutil.rmtree
+
+    def written_meanwhile(path: Path, **options: bool) -> None:
+        sweep(path, **options)  # type: ignore[call-overload]
+        if path.parent == left and not (left / "late").exists():
+            (left / "late").touch()
+
+    (left / "worker").mkdir(parents=True)
+    (left / ".brmgeo-scratch").touch()
+    monkeypatch.setattr(shutil, "rmtree", written_meanwhile)
+    with files.scratch_folder("test"):
+        assert sorted(p.name for p in left.iterdir()) == [".brmgeo-scratch", "late"], (
+            "its lock stays, to be found"
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_files_below_a_folder_are_named_from_it(tmp_path: Path) -> None:
     for name in ("b.txt", "a/c.txt", "a/.d/e.txt", ".f.txt"):
         path = tmp_path / name

@@ -436,14 +436,22 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
 
 def _require_room(path: Path) -> None:
     """InputError where a GeoParquet file does not fit into memory: packed, a few bytes may stand for any number."""
+    import pyarrow.compute
     import pyarrow.parquet
 
-    file = pyarrow.parquet.ParquetFile(path)
-    needed = _BYTES_A_ROW * file.metadata.num_rows
+    names = [c.name for c in pyarrow.parquet.read_schema(path) if pyarrow.types.is_binary(c.type)]
+    # As a dictionary a value that many rows share is unpacked once.
+    file = pyarrow.parquet.ParquetFile(path, read_dictionary=names)
+    needed = float(_BYTES_A_ROW * file.metadata.num_rows)
     instead = "cut the area that you need out of the file first, such as with ogr2ogr -spat"
     for batch in file.iter_batches():
+        for column in batch.columns:
+            if pyarrow.types.is_dictionary(column.type):
+                sizes = pyarrow.compute.binary_length(column.dictionary).take(column.indices)
+                needed += _TIMES_UNPACKED * (pyarrow.compute.sum(sizes).as_py() or 0)
+            else:
+                needed += _TIMES_UNPACKED * column.nbytes
         require_memory(needed, f"{path.name} of {file.metadata.num_rows} rows", instead)
-        needed += _TIMES_UNPACKED * batch.nbytes
 
 
 @contextmanager

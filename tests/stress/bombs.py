@@ -77,7 +77,13 @@ def _parquet(folder: Path, request: pytest.FixtureRequest) -> tuple[object, ...]
     }
     chunks = pa.chunked_array([column.cast(pa.binary())] * 30)
     table = pa.table({"geometry": chunks}).replace_schema_metadata({"geo": json.dumps(geo)})
-    pq.write_table(table, folder / "b.parquet", compression="zstd", use_dictionary=True)
+    pq.write_table(
+        table,
+        folder / "b.parquet",
+        compression="zstd",
+        use_dictionary=True,
+        dictionary_pagesize_limit=1 << 24,
+    )
     return _maps_of(folder / "b.parquet")
 
 

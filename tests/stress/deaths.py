@@ -19,7 +19,7 @@ import pytest
 from arena import ROOT
 from kills import Job, Run, maps_of_a_region
 
-END_S = 60.0  # for a whole run, with what it had to do before
+END_S = 90.0  # for a whole run, with what it had to do before; of dead workers it waits a minute for new ones
 
 
 @pytest.fixture
