@@ -479,8 +479,7 @@ def scratch_folder(what: str) -> Iterator[Path]:
 
     Folders of the same user's runs that were killed are removed before and after: nobody holds the lock in them any more.
     """
-    temporary = Path(tempfile.gettempdir())
-    _sweep(temporary)
+    sweep_scratch()
     while True:
         folder = Path(tempfile.mkdtemp(prefix=f"brmgeo-{what}-"))
         lock = open_lock(folder / _HELD)
@@ -496,12 +495,12 @@ def scratch_folder(what: str) -> Iterator[Path]:
         os.close(lock)
         _clear(folder)  # Windows keeps a lock file as long as it is open
         # Workers of a killed run may have outlived it when this one began.
-        _sweep(temporary)
+        sweep_scratch()
 
 
-def _sweep(temporary: Path) -> None:
-    """Removes scratch folders of this user's whose processes are gone; a link is never followed."""
-    for folder in temporary.glob("brmgeo-*"):
+def sweep_scratch() -> None:
+    """Removes this user's scratch folders in the temporary one whose processes are gone; a link is never followed."""
+    for folder in Path(tempfile.gettempdir()).glob("brmgeo-*"):
         with contextlib.suppress(OSError):  # its owner may clear it away just now
             if folder.is_symlink() or (hasattr(os, "getuid") and folder.lstat().st_uid != os.getuid()):
                 continue

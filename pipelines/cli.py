@@ -84,7 +84,11 @@ class _Command(click.Command):
         self.params.append(click.Option([TRACEBACK], is_flag=True, expose_value=False, hidden=True))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """As click's own, with the option named in the message; numbers that are none, or have no end, are refused."""
+        """As click's own, with the option named in the message; numbers that are none, or have no end, are refused.
+
+        Scratch of runs that were killed goes first: this one may have no need of any, and would leave it.
+        """
+        files.sweep_scratch()
         for param in self.params:
             value = ctx.params.get(param.name or "")
             if any(
