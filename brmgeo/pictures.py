@@ -20,6 +20,11 @@ from brmgeo.files import told
 #: Endings of the picture files that are looked for in folders.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _JPEG_FLAGS = (cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR, cv2.IMREAD_GRAYSCALE)
+# Where Pillow takes a picture for a bomb.
+_MOST_PX = 178_956_970
+_TOO_MANY = "too many pixels for one picture"
+# Words of Pillow's errors for a picture whose kind it knows; "decoder error" is that of compressed TIFFs.
+_DAMAGE = ("truncated", "broken", "decoder error")
 
 
 def read_bytes(path: Path) -> bytes:
@@ -64,7 +69,9 @@ def _jpeg(data: bytes, name: str, flags: int) -> NDArray[Any] | None:
     OpenCV fills up what is missing of a picture with grey and says nothing of what it could not make sense of.
     """
     try:
-        _, _, colours, _ = simplejpeg.decode_jpeg_header(data)
+        height, width, colours, _ = simplejpeg.decode_jpeg_header(data)
+        if height * width > _MOST_PX:
+            raise _faulty(name, _TOO_MANY)
         if colours not in ("Gray", "YCbCr", "RGB") or flags not in _JPEG_FLAGS:
             return None
         grey = flags == cv2.IMREAD_GRAYSCALE or (flags == cv2.IMREAD_UNCHANGED and colours == "Gray")
@@ -84,10 +91,10 @@ def _require_whole(data: bytes, name: str) -> None:
             with Image.open(io.BytesIO(data)) as shown:
                 shown.load()
     except Image.DecompressionBombError:
-        raise _faulty(name, "too many pixels for one picture") from None
+        raise _faulty(name, _TOO_MANY) from None
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         # Pillow knows fewer kinds of TIFF and PNG than OpenCV; of those OpenCV's word counts.
-        if data[:2] == b"\xff\xd8" or "truncated" in str(error) or "broken" in str(error):
+        if data[:2] == b"\xff\xd8" or any(word in str(error) for word in _DAMAGE):
             raise _faulty(name, f"damaged or cut short ({error})") from None
 
 

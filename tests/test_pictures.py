@@ -188,3 +188,23 @@ def test_a_palette_is_a_table_of_256_colours() -> None:
     assert pictures.palette_of(_Raster(C.gray), Path("a.tif"), (1,)) is None
     with pytest.raises(InputError, match=r"a\.tif: a palette of uint16"):
         pictures.palette_of(_Raster(C.palette, dtype="uint16"), Path("a.tif"), (1,))
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate"])
+def test_damage_that_the_decoder_of_a_tiff_tells_is_no_picture(compression: str) -> None:
+    """OpenCV fills up what follows it, and only its log says so."""
+    buffer = io.BytesIO()
+    Image.fromarray(_noise()).save(buffer, "TIFF", compression=compression)
+    data = bytearray(buffer.getvalue())
+    assert (pictures.decode(bytes(data), "a.tif") == _noise()).all()
+    data[len(data) // 2 : len(data) // 2 + 8] = b"\xff" * 8
+    with pytest.raises(InputError, match=r"a\.tif: damaged"):
+        pictures.decode(bytes(data), "a.tif")
+
+
+def test_a_jpeg_that_promises_billions_of_pixels_is_refused_before_it_is_decoded() -> None:
+    data = bytearray(pictures.encode(_picture(), ".jpg"))
+    at = data.find(b"\xff\xc0") + 5
+    data[at : at + 4] = (65_500).to_bytes(2, "big") * 2
+    with pytest.raises(InputError, match=r"a\.jpg: too many pixels"):
+        pictures.decode(bytes(data), "a.jpg")
