@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -236,7 +236,8 @@ def whole_folder(
     After an error ``out`` stays as it was. What a run killed between the two renames left aside is put back first, and
     scratch folders of this ``out`` that nobody has touched for an hour are removed.
     """
-    out = out.absolute()
+    # A link stays, and the folder that it leads to is replaced.
+    out = Path(os.path.realpath(out)) if out.is_symlink() else out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
     _tidy(out)
     scratch = out.with_name(f"{SCRATCH}{out.name}-{uuid.uuid4().hex[:12]}")
@@ -247,15 +248,19 @@ def whole_folder(
             yield scratch
             list_written(scratch, list(files_below(scratch)))
             told = _carry(out, scratch, ours) if say is not None and out.is_dir() else []
-        if say is None and out.is_dir() and any(out.iterdir()):
-            raise SettingsError(f"{out} is there by now, made by another run: choose another", needs="out")
-        if out.exists():
+        if say is not None and out.exists():
             os.rename(out, old)
         try:
-            os.rename(scratch, out)
-        except BaseException:
+            if sys.platform == "win32" and say is None and out.is_dir():
+                out.rmdir()
+            os.rename(scratch, out)  # onto an empty folder at most
+        except BaseException as error:
             if old.exists() and not out.exists():
                 os.rename(old, out)
+            if isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                raise SettingsError(
+                    f"{out} is there by now, made by another run: choose another", needs="out"
+                ) from None
             raise
         shutil.rmtree(old, ignore_errors=True)
         for line in told:
@@ -280,9 +285,7 @@ def foreign_in(folder: Path) -> list[str] | None:
     known = read_json(folder / WRITTEN)
     if not isinstance(known, dict):
         return None
-    return [
-        n for n in sorted(_entries(folder)) if n != WRITTEN and not _is_as_written(folder / n, known.get(n))
-    ]
+    return [n for n in sorted(_entries(folder)) if n != WRITTEN and not _is_as_written(folder, n, known)]
 
 
 def set_aside(folder: Path, names: Sequence[str], say: Say) -> None:
@@ -291,7 +294,7 @@ def set_aside(folder: Path, names: Sequence[str], say: Say) -> None:
     known = known if isinstance(known, dict) else {}
     for name in names:
         path = folder / name
-        if os.path.lexists(path) and not _is_as_written(path, known.get(name)):
+        if os.path.lexists(path) and not _is_as_written(folder, name, known):
             kept = _edited(path)
             os.rename(path, kept)
             say(_kept_line(path, kept))
@@ -348,17 +351,19 @@ def _entries(folder: Path) -> Iterator[str]:
                 yield (Path(top) / name).relative_to(folder).as_posix()
 
 
-def _is_as_written(path: Path, known: object) -> bool:
-    """Whether a file is the one that was listed with the digest ``known``; what SQLite keeps beside it goes with it."""
+def _is_as_written(folder: Path, name: str, known: Mapping[str, object]) -> bool:
+    """Whether a file is the one that was listed; what SQLite keeps beside a listed database goes with it."""
+    path = folder / name
     if path.is_symlink() or not path.is_file():
         return False
-    if path.name.endswith(_BESIDE_SQLITE):
+    if name.endswith(_BESIDE_SQLITE) and name not in known:
+        database = name[: -len("-wal")]
         # Of a database that somebody works on; alone, or without a word in it, nothing is lost.
-        return path.stat().st_size == 0 or not path.with_name(path.name[: -len("-wal")]).is_file()
+        return database in known and (path.stat().st_size == 0 or not (folder / database).is_file())
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         return False
-    return known == content_digest(path)
+    return known.get(name) == content_digest(path)
 
 
 def _tidy(out: Path, older_than_s: float = 3600.0) -> None:

@@ -455,6 +455,35 @@ def test_a_folder_that_is_replaced_keeps_what_is_not_ours(tmp_path: Path) -> Non
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+def test_a_file_that_only_sounds_like_one_of_sqlite_is_the_user_s(tmp_path: Path) -> None:
+    out, told = tmp_path / "out", list[str]()
+    _results(out, "first", told.append)
+    (out / "notes-wal").write_text("mine")
+    (out / "empty-shm").touch()
+    (out / "a.csv-wal").touch()  # beside a file of ours, without a word in it
+    _results(out, "second", told.append)
+    assert names_in(out) == ["a.csv", "empty-shm", "map.qgz", "notes-wal"]
+    assert (out / "notes-wal").read_text() == "mine"
+
+
+def test_a_link_to_a_folder_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "out").symlink_to("real")
+    told = list[str]()
+    for text in ("first", "second"):
+        _results(tmp_path / "out", text, told.append)
+    assert os.readlink(tmp_path / "out") == "real"
+    assert (tmp_path / "real" / "a.csv").read_text() == "second"
+    assert names_in(tmp_path) == ["out", "real"]
+    with pytest.raises(SettingsError, match="made by another run"), files.whole_folder(tmp_path / "out"):
+        pass
+    (tmp_path / "new").mkdir()
+    (tmp_path / "link").symlink_to("new")
+    with files.whole_folder(tmp_path / "link") as work:
+        (work / "a").touch()
+    assert names_in(tmp_path / "new") == ["a"]
+
+
 def test_a_folder_of_before_there_were_lists_is_ours_by_names(tmp_path: Path) -> None:
     out, told = tmp_path / "out", list[str]()
     out.mkdir()
