@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError, SettingsError, listed
 from brmgeo.files import digest_of
-from brmgeo.geo.formats import raster_driver
+from brmgeo.geo.formats import open_raster
 from brmgeo.geo.grid import Bounds, as_bounds, bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import grid_named
@@ -196,13 +196,12 @@ def _is_placed(path: Path) -> bool:
     """Whether a raster says where it lies, by its own header or a world file beside it."""
     import warnings
 
-    import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            with rasterio.open(path, driver=raster_driver(path)) as src:
+            with open_raster(path) as src:
                 return not src.transform.is_identity or bool(src.gcps[0])
         except (InputError, RasterioError):
             return True  # the adapter says what is wrong with it

@@ -6,12 +6,22 @@ names other files, services or commands (VRT, WMS, WFS, OGR VRT, GDALG). Who ope
 
 from __future__ import annotations
 
+import mmap
+import os
 import re
+import warnings
 import zipfile
 from pathlib import Path
+from typing import Any
+
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
 
 from brmgeo.errors import InputError, MissingInputError
 from brmgeo.files import told
+
+# GDAL would ask the host that a GML file names for its schema.
+os.environ.setdefault("GML_DOWNLOAD_SCHEMA", "NO")
 
 _HEAD = 1 << 16
 # GDAL looks for these anywhere in a file's first bytes.
@@ -32,6 +42,10 @@ _SHAPES = re.compile(rb"\0\0\x27\x0a|SQLite format 3\0|fgb\x03|PAR1")
 _ROOTS = {b"kml", b"FeatureCollection", b"osm", b"gpx", b"CityModel"}
 _VECTOR_WORDS = "shapefile, GeoPackage, GeoJSON, GeoParquet, FlatGeobuf, KML, GML, OSM, GPX, CSV, MapInfo, File Geodatabase"
 _TEXTS = {".csv", ".tsv", ".txt", ".tab", ".mif", ".geojsonl", ".geojsons"}
+# A coordinate reference system that GDAL would fetch.
+_LINKED_CRS = re.compile(
+    rb'"crs"\s*:\s*\{[^{}]*(?:\{[^{}]*\}[^{}]*)?"type"\s*:\s*"(?:link|url)', re.IGNORECASE
+)
 # What lies beside or within a shapefile.
 _BESIDE = {
     ".dbf",
@@ -51,25 +65,44 @@ _BESIDE = {
 
 
 def raster_driver(path: Path) -> str:
-    """The GDAL driver of a raster file, for ``rasterio.open(path, driver=...)``.
-
-    Raises MissingInputError where it is not there, InputError for any other format, and where a file beside it would make
-    GDAL open something else.
-    """
+    """The GDAL driver of a raster file; MissingInputError where it is not there, InputError for any other format."""
     head = _head_of(path)
     found = next((driver for magic, driver in _RASTERS if re.match(magic, head, re.DOTALL)), None)
     if found is None:
         raise InputError(
             f"{path} is not a readable image or raster ({_RASTER_WORDS}){_named_in(head)}; convert or fetch it again"
         )
-    for suffix in (".ovr", ".msk"):
-        beside = path.with_name(path.name + suffix)
-        if beside.is_file() and not re.match(_RASTERS[0][0], _head_of(beside)):
-            raise InputError(f"{beside} is no TIFF, as what lies beside {path.name} must be: move it away")
-    for beside in (path.with_name(f"{path.name}.aux.xml"), path.with_suffix(".aux.xml")):
-        if beside.is_file() and b"OVERVIEW_FILE" in beside.read_bytes():
-            raise InputError(f"{beside} names another file to be read for {path.name}: move it away")
     return found
+
+
+def open_raster(path: Path) -> Any:
+    """A raster file opened for reading by rasterio, whose errors pass.
+
+    Raises MissingInputError and InputError as ``raster_driver``, and InputError where the file, or one beside it, names
+    another as its overview, which GDAL would open, whatever it is.
+    """
+    driver = raster_driver(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        for beside in _overviews_and_masks(path):
+            if raster_driver(beside) != "GTiff":
+                raise InputError(
+                    f"{beside} is no TIFF, as what lies beside {path.name} must be: move it away"
+                )
+            open_raster(beside).close()
+    src = rasterio.open(path, driver=driver)
+    if any(name.upper() == "OVERVIEW_FILE" for name in src.tags(ns="OVERVIEWS")):
+        src.close()
+        raise InputError(
+            f"{path}: it, or its .aux.xml, names another file as its overview, which is not followed: convert it"
+        )
+    return src
+
+
+def _overviews_and_masks(path: Path) -> list[Path]:
+    """Files whose names say that they are the raster's; GDAL does not tell upper from lower case there."""
+    wanted = {path.name.lower() + suffix for suffix in (".ovr", ".msk")}
+    return [path.with_name(name) for name in os.listdir(path.parent) if name.lower() in wanted]
 
 
 def vector_file(path: Path) -> Path:
@@ -87,7 +120,21 @@ def vector_file(path: Path) -> Path:
         _require_shapes_inside(path)
     else:
         _require_shapes(head, path.suffix.lower(), str(path))
+        if _is_json(head):
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
+                _require_own_crs(whole, str(path))
     return path
+
+
+def _is_json(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith((b"{", b"["))
+
+
+def _require_own_crs(text: bytes | mmap.mmap, name: str) -> None:
+    if _LINKED_CRS.search(text):
+        raise InputError(
+            f"{name}: its CRS is a link, which is not followed: write it in longitude and latitude"
+        )
 
 
 def _require_shapes_inside(path: Path) -> None:
@@ -109,7 +156,8 @@ def _require_shapes(head: bytes, suffix: str, name: str) -> None:
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     if _POINTERS.search(head):
         good = False
-    elif text.startswith((b"{", b"[")):
+    elif _is_json(head):
+        _require_own_crs(head, name)
         good = True
     elif text.startswith(b"<"):
         good = _root_of(text) in _ROOTS

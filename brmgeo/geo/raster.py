@@ -22,7 +22,7 @@ from rasterio.errors import RasterioError, RasterioIOError
 
 from brmgeo.codes import RATIO_SCALE, RATIO_UNKNOWN
 from brmgeo.errors import InputError, MissingInputError, one_line
-from brmgeo.geo.formats import raster_driver
+from brmgeo.geo.formats import open_raster
 from brmgeo.geo.grid import Bounds, Window
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def opened(path: Path) -> Iterator[Any]:
     if not Path(path).is_file():
         raise MissingInputError(f"there is no raster {path}: build the maps first")
     try:
-        src = rasterio.open(path, driver=raster_driver(path))
+        src = open_raster(path)
     except RasterioIOError as error:
         raise InputError(f"{path} is not a readable raster: {one_line(error)}") from error
     with src:

@@ -413,7 +413,8 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
                 frame = pyogrio.read_dataframe(
                     vector_file(whole), layer=layer, encoding=encoding, on_invalid="ignore"
                 )
-                if suffix == ".fgb" and len(frame) < (counted := pyogrio.read_info(whole)["features"]):
+                counted = pyogrio.read_info(vector_file(whole))["features"] if suffix == ".fgb" else 0
+                if len(frame) < counted:
                     raise InputError(
                         f"{path.name}: cut short or damaged: {len(frame)} of its {counted} features are there: "
                         "fetch the file again"

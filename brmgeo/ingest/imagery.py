@@ -37,7 +37,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
 from brmgeo.geo.crs import belt_for_sheet, crs_name, parse_crs, same_crs, transform_bounds, transformer
-from brmgeo.geo.formats import raster_driver
+from brmgeo.geo.formats import open_raster
 from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
 from brmgeo.geo.tilegrid import Tile
@@ -261,7 +261,7 @@ def _plane_of(source: ImagerySource) -> Iterator[_Plane]:
         # Said better below, with what to do.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            src = rasterio.open(path, driver=raster_driver(path))
+            src = open_raster(path)
         except (RasterioError, CPLE_BaseError) as error:
             raise InputError(
                 f"{path} is not a readable image ({one_line(error)}); fetch or export it again"

@@ -22,8 +22,8 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
 from brmgeo.errors import InputError, one_line
+from brmgeo.geo import formats
 from brmgeo.geo.crs import LONLAT, transformer
-from brmgeo.geo.formats import raster_driver
 from brmgeo.geo.grid import Window
 from brmgeo.memory import require_memory
 from brmgeo.pictures import colour_bands, palette_of, scaled_levels
@@ -226,7 +226,7 @@ def open_raster(
         with warnings.catch_warnings():
             # That a raster has no place is told as an error of its own.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            src = rasterio.open(path, driver=raster_driver(path))
+            src = formats.open_raster(path)
         with src:
             yield RasterReader(src, path, segmenter, levels, bands)
     except RasterioError as error:

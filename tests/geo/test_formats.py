@@ -18,7 +18,7 @@ from affine import Affine
 from small_flights import CRS, LEFT, TOP, Said
 
 from brmgeo.errors import InputError, MissingInputError
-from brmgeo.geo.formats import raster_driver, vector_file
+from brmgeo.geo.formats import open_raster, raster_driver, vector_file
 from brmgeo.ingest.footprints import read_footprints
 
 SQUARE = gpd.GeoDataFrame(geometry=[shapely.box(LEFT, TOP - 20, LEFT + 20, TOP)], crs=CRS)
@@ -133,19 +133,71 @@ def test_rasters_are_opened_by_their_content(driver: str, tmp_path: Path) -> Non
     assert raster_driver(tmp_path / "odd") == driver
 
 
-def test_what_lies_beside_a_raster_leads_nowhere_else(maps: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["x.tif.ovr", "x.tif.OVR", "X.tif.Msk"])
+def test_what_lies_beside_a_raster_leads_nowhere_else(
+    name: str, host: tuple[str, list[str]], maps: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "x.tif"
     path.write_bytes((maps / "buildings.tif").read_bytes())
-    assert raster_driver(path) == "GTiff"
-    (tmp_path / "x.tif.aux.xml").write_text(
-        '<MDI key="OVERVIEW_FILE">/vsicurl/http://127.0.0.1:1/x.tif</MDI>'
-    )
+    open_raster(path).close()
+    (tmp_path / name).write_bytes(path.read_bytes())
+    open_raster(path).close()
+    (tmp_path / name).write_text(_pointers(host[0])["VRT"])
+    with pytest.raises(InputError, match=f"{name} is not .*points to other sources"):
+        open_raster(path)
+    (tmp_path / name).write_bytes(b"BM" + bytes(99))
+    with pytest.raises(InputError, match=f"{name} is no TIFF"):
+        open_raster(path)
+    assert host[1] == []
+
+
+@pytest.mark.parametrize("key", ["OVERVIEW_FILE", "overview_file", "OVERVIEW&#95;FILE", None])
+def test_an_overview_elsewhere_is_not_followed(
+    key: str | None, host: tuple[str, list[str]], maps: Path, tmp_path: Path
+) -> None:
+    """Neither one that a file beside it names, nor its own tags."""
+    path, elsewhere = tmp_path / "x.tif", f"/vsicurl/{host[0]}/x.tif"
+    path.write_bytes((maps / "buildings.tif").read_bytes())
+    if key is None:
+        profile = {"width": 64, "height": 64, "count": 1, "dtype": "uint8", "crs": CRS}
+        with rasterio.open(
+            path, "w", driver="GTiff", transform=Affine(1, 0, LEFT, 0, -1, TOP), **profile
+        ) as out:
+            out.write(np.ones((1, 64, 64), np.uint8))
+            out.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=elsewhere)
+    else:
+        entry = f'<MDI key="{key}">{elsewhere}</MDI>'
+        (tmp_path / "x.tif.aux.xml").write_text(
+            f'<PAMDataset><Metadata domain="OVERVIEWS">{entry}</Metadata></PAMDataset>'
+        )
     with pytest.raises(InputError, match="names another file"):
-        raster_driver(path)
-    (tmp_path / "x.tif.aux.xml").unlink()
-    (tmp_path / "x.tif.ovr").write_text(_pointers("http://127.0.0.1:1")["VRT"])
-    with pytest.raises(InputError, match=r"x\.tif\.ovr is no TIFF"):
-        raster_driver(path)
+        open_raster(path)
+    assert host[1] == []
+
+
+def test_schemas_and_reference_systems_are_not_fetched(host: tuple[str, list[str]], tmp_path: Path) -> None:
+    url, asked = host
+    gml = tmp_path / "x.gml"
+    gml.write_text(
+        '<wfs:FeatureCollection xmlns:wfs="http://www.opengis.net/wfs" xmlns:gml="http://www.opengis.net/gml" '
+        'xmlns:a="http://a" xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
+        f'xsi:schemaLocation="http://a {url}/?SERVICE=WFS&amp;VERSION=1.0.0&amp;REQUEST=DescribeFeatureType">'
+        "<gml:featureMember><a:b><a:g><gml:Polygon><gml:outerBoundaryIs><gml:LinearRing><gml:coordinates>"
+        f"{LEFT},{TOP} {LEFT},{TOP - 20} {LEFT + 20},{TOP} {LEFT},{TOP}"
+        "</gml:coordinates></gml:LinearRing></gml:outerBoundaryIs></gml:Polygon></a:g></a:b></gml:featureMember>"
+        "</wfs:FeatureCollection>"
+    )
+    assert len(read_footprints(gml, CRS, source_crs=CRS).frame) == 1
+    linked = tmp_path / "x.geojson"
+    pyogrio.write_dataframe(SQUARE.to_crs("EPSG:4326"), linked, driver="GeoJSON")
+    crs = f'"crs": {{"type": "link", "properties": {{"href": "{url}/crs", "type": "proj4"}}}},'
+    linked.write_text(linked.read_text().replace("{", "{" + crs, 1))
+    with zipfile.ZipFile(tmp_path / "x.zip", "w") as packed:
+        packed.write(linked, "x.geojson")
+    for path in (linked, tmp_path / "x.zip"):
+        with pytest.raises(InputError, match="its CRS is a link"):
+            read_footprints(path, CRS)
+    assert asked == []
 
 
 @pytest.mark.parametrize("check", [raster_driver, vector_file])
