@@ -52,11 +52,12 @@ _RETRY_STATUS = {408, 425, 429, 500, 502, 503, 504}
 _ABSENT_STATUS = {204, 404, 410}
 _LONGEST_WAIT_S = 120.0
 # A key typed into a URL would go into provenance: a user's name and password, query parameters whose names say that they
-# carry one, and what no person writes: twenty letters and digits in a row.
+# carry one, and what no person writes: twenty letters and digits in a row, or the groups of a UUID (VWorld's keys).
 _KEYS_IN_URLS = re.compile(
     r"://[^/?#]*@"
     r"|[?&;](?:[\w.-]*(?:key|token|secret|signature|auth|pass|credential|session)\w*|sig|sign|pwd?|jwt)=(?!\{key\})[^&;{}]+"
-    r"|(?<![A-Za-z0-9])(?=[A-Za-z]*[0-9])(?=[0-9]*[A-Za-z])(?=(?:[A-Za-z]*[0-9]){3})[A-Za-z0-9]{20,}",
+    r"|(?<![A-Za-z0-9])(?=[A-Za-z]*[0-9])(?=[0-9]*[A-Za-z])(?=(?:[A-Za-z]*[0-9]){3})[A-Za-z0-9]{20,}"
+    r"|[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}",
     re.IGNORECASE,
 )
 

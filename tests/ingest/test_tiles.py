@@ -316,6 +316,7 @@ def test_service_settings_are_checked(tmp_path: Path) -> None:
         "https://a/{z}/{x}/{y}?x=1;subscription-key=abc",
         "https://user:abc@a/{z}/{x}/{y}",
         "https://a/9f86d081884c7d659a2feaabc/{z}/{x}/{y}",
+        "https://a/req/wmts/1.0.0/0A1B2C3D-1ABC-2ABC-3ABC-0123456789AB/Satellite/{z}/{y}/{x}.jpeg".lower(),
     ):
         with pytest.raises(SettingsError, match="what looks like a key") as caught:
             TileService(url, GRID, 3, tmp_path)
