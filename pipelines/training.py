@@ -21,7 +21,7 @@ from brmgeo.segment.shards import FORMAT, TILES_JSON
 from brmgeo.settings import checked
 from brmgeo.workflow.plan import Plan
 from brmgeo.workflow.progress import Progress
-from brmgeo.workflow.publish import PUBLISHED, publish
+from brmgeo.workflow.publish import PUBLISHED, publish, withdraw
 from brmgeo.workflow.schedule import scheduler
 from brmgeo.workflow.store import Artifact, Store
 
@@ -150,8 +150,8 @@ def publish_tiles(made: Mapping[str, Artifact], names: Mapping[str, str], out: P
     if "alignment" in made:
         publish(made["alignment"], out, ["alignment.json"], say)
         wanted.add("alignment.json")
-    for stale in before - wanted:
-        (out / stale).unlink(missing_ok=True)  # of an earlier cut with other settings
+    if before - wanted:  # of an earlier cut with other settings
+        withdraw(out, before - wanted, say)
 
 
 def status_lines(name: str, data: Path, verify: bool = False) -> list[str]:

@@ -44,8 +44,7 @@ def publish(
         out.mkdir(parents=True, exist_ok=True)
         for folder in {out, *((out / goal).parent for goal in wanted)}:
             files.clear_scratch(folder, older_than_s=0.0)
-        known = files.read_json(out / PUBLISHED)
-        known = known if isinstance(known, dict) else {}
+        known = _known(out)
         before = dict(known)
         try:
             for goal, (source, entry) in sorted(wanted.items()):
@@ -66,14 +65,39 @@ def publish(
                 known[goal] = [digest, *_look(place)]
                 written.append(goal)
             for goal in [g for g in known if g not in wanted and any(g.startswith(f"{r}/") for r in roots)]:
-                if not os.path.lexists(out / goal) or known[goal][0] == files.digest(out / goal):
-                    (out / goal).unlink(missing_ok=True)
-                del known[goal]
+                _withdraw(out / goal, known.pop(goal), say)
         finally:
             if known != before:
                 files.write_json(out / PUBLISHED, known, durable=True)
         files.sync(out)
     return written
+
+
+def withdraw(out_dir: Path | str, names: Iterable[str], say: files.Say) -> None:
+    """Removes files that were published and nothing replaces; one that somebody changed stays, which ``say`` is told."""
+    out = Path(out_dir).absolute()
+    with disk_errors(f"results in {out}", out):
+        known = _known(out)
+        for name in names:
+            _withdraw(out / name, known.pop(name, None), say)
+        files.write_json(out / PUBLISHED, known, durable=True)
+
+
+def _withdraw(place: Path, known: Json, say: files.Say) -> None:
+    if known is not None and place.is_file() and known[0] != files.digest(place):
+        say(f"{place}: not as brmgeo wrote it, so it is kept, though it belongs to earlier results")
+    else:
+        place.unlink(missing_ok=True)
+
+
+def _known(out: Path) -> dict[str, Json]:
+    """[digest, size, time] of each file by its name, as far as the list in the folder can be made out."""
+    known = files.read_json(out / PUBLISHED)
+    return {
+        name: entry
+        for name, entry in (known.items() if isinstance(known, dict) else ())
+        if isinstance(entry, list) and len(entry) == 3
+    }
 
 
 def _is_published(place: Path, known: Json, source: Path) -> bool:

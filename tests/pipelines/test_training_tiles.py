@@ -215,8 +215,14 @@ def test_files_of_the_users_own_stay_beside_the_tiles(
     own = {"small-backup.tar", "small-0800-777.tar", "small-0800-000.tar.part"}
     for name in own:
         (region.out / "tiles" / name).write_bytes(b"mine")
-    assert cut(capsys, region, "--gsd", "1.7", "--split", "test").status == 0
+    edited = tiles_of(region).facts["shards"][0]["file"]
+    (region.out / "tiles" / edited).write_bytes(b"mine too")
+    said = cut(capsys, region, "--gsd", "1.7", "--split", "test")
+    assert said.status == 0
     shards = {s["file"] for s in tiles_of(region).facts["shards"]}
+    assert edited not in shards
+    assert f"{edited}: not as brmgeo wrote it, so it is kept" in said.out + said.err
+    own.add(edited)
     assert {p.name for p in (region.out / "tiles").glob("*.tar*")} == shards | own
 
 

@@ -709,10 +709,16 @@ def test_a_geopackage_that_was_only_opened_is_not_changed(tmp_path: Path) -> Non
     assert files.content_digest(path) != before
 
 
-def test_publish_without_its_memory_writes_again(store: Store, source: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "memory", ["{broken", '{"words.txt": 5, "parts/x": null}', '{"words.txt": {"sha256": 1}, "parts/x": []}']
+)
+def test_publish_without_its_memory_writes_again(
+    memory: str, store: Store, source: Path, tmp_path: Path
+) -> None:
     made = words(store, source)
-    publish(made, tmp_path / "out", ["words.txt"], print)
-    (tmp_path / "out" / ".brmgeo-published.json").write_text("{broken")
+    publish(made, tmp_path / "out", ["words.txt", "parts"], print)
+    (tmp_path / "out" / ".brmgeo-published.json").write_text(memory)
+    (tmp_path / "out" / "words.txt").write_text("edited")
     assert publish(made, tmp_path / "out", ["words.txt"], print) == ["words.txt"]
 
 
