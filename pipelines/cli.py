@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from brmgeo import __version__, extras, files
 from brmgeo.errors import BrmgeoError, SettingsError, one_line
@@ -112,6 +113,16 @@ def _shown(param: click.Parameter, ctx: click.Context) -> str | None:
         return None
     value = "" if param.is_flag else f" {param.make_metavar(ctx)}"
     return f"{param.opts[0]}{value}"
+
+
+def _refuse_given(why: str, *parameters: str) -> None:
+    """SettingsError for the first of these parameters that the command line has, where it would change nothing."""
+    context = click.get_current_context()
+    for param in context.command.params:
+        given = context.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
+        if param.name in parameters and given:
+            name = param.opts[0] if isinstance(param, click.Option) else param.make_metavar(context)
+            raise SettingsError(f"{context.info_name}: {name} {why}")
 
 
 class _Group(click.Group):
@@ -517,6 +528,8 @@ def simulate(
         raise SettingsError(
             "simulate --count: each flight is named by its seed, simulated-SEED; leave --name out"
         )
+    if no_odometry:
+        _refuse_given("is of the odometry, and --no-odometry has none: leave one out", "scale_bias")
     if season is not None and (region is None or mode == "masks"):
         raise SettingsError("simulate --season: needs a generated REGION, and --mode frames or both")
     built = maps_for("simulate", region, maps_dir, data, scheduler)
@@ -638,6 +651,8 @@ def localize(
     from .regions import note_flown
     from .simulate import default_flight
 
+    if flight is not None:
+        _refuse_given("is that of a simulated flight, and --flight is there already: leave one out", "seed")
     built = maps_for("localize", region, maps_dir, data, scheduler)
     if flight is None:
         if built.region is None:
@@ -755,6 +770,10 @@ def evaluate(
     from .simulate import other_day
 
     if results:
+        kept = {"results", "out", "data", "scheduler"}
+        params = click.get_current_context().command.params
+        others = [p.name for p in params if p.name and p.expose_value and p.name not in kept]
+        _refuse_given("goes with simulated flights, and --results are flown already: leave one out", *others)
         click.echo(job.compare_results(results, out))
         return
     built = maps_for("evaluate", region, maps_dir, data, scheduler)
@@ -1102,6 +1121,8 @@ def odometry(flight: Path, method: str, thin: Path | None, every_s: float) -> No
     """Make the odometry of FLIGHT (a folder) from its own frames, IMU and height, and write it there."""
     from . import odometry as job
 
+    if thin is None:
+        _refuse_given("goes with --thin: give both or none", "every_s")
     facts = job.make_odometry(flight, job.method_named(method))
     for line in job.summary(facts):
         click.echo(line)

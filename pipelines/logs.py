@@ -61,12 +61,24 @@ def _write_pictures(work: Path, pictures: Pictures, names: dict[int, str]) -> No
 
 def _left_out(log: Log, settings: ImportSettings) -> list[str]:
     # Options that this log or video has no use for.
-    out: list[str] = []
-    if is_of_camera(log) and any(settings.mount_deg):
-        out.append("--mount was left out: the photos tell the camera's own attitude (gimbal), so it has none")
-    if settings.video is not None and settings.shift_frames_s:
-        out.append("--shift-frames was left out: with --video, --video-start says when its frames were taken")
-    return out
+    options, video, photos = settings.options, settings.video is not None, settings.photos is not None
+    bag, text = log.kind == "rosbag", log.kind not in ("rosbag", "ulog", "ardupilot", "mavlink", "photos")
+    gimbal = "the photos tell the camera's own attitude (gimbal), so it has none"
+    unused = (
+        ("--mount", is_of_camera(log) and any(settings.mount_deg), gimbal),
+        ("--shift-frames", video and settings.shift_frames_s, "with --video, --video-start says when its frames were taken"),
+        ("--video-start", not video and settings.video_start_s, "there is no --video"),
+        ("--photos", video and photos, "the pictures are those of --video"),
+        ("--image-topic", options.image_topic and (video or photos), "the pictures are no bag's"),
+        ("--image-topic", options.image_topic and not bag, "this is no bag"),
+        ("--imu-topic", options.imu_topic and not bag, "this is no bag"),
+        ("--topic", options.topic and (text or log.kind == "photos"), "there is but one track"),
+        ("--format", options.format and not text, "this is no text of poses"),
+        ("--quaternion", options.quaternion and not text, "this is no text of poses"),
+        ("--times", options.frame_times_s is not None and log.kind != "kitti", "the log tells its own"),
+        ("--ground", settings.agl_m is not None and settings.ground_m is not None, "--agl tells the height"),
+    )  # fmt: skip
+    return [f"{option} was left out: {why}" for option, is_so, why in unused if is_so]
 
 
 def inspect_document(paths: Sequence[Path], options: LogOptions | None = None) -> tuple[str, int]:

@@ -203,6 +203,41 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     assert good(tmp_path / "m", images, "--agl", 60, "--fov", 43).frames[3].agl_m == 60.0
 
 
+def test_options_that_a_log_has_no_use_for_are_told(tmp_path: Path) -> None:
+    path, times = tmp_path / "o.tum", tmp_path / "times.txt"
+    path.write_text(
+        "\n".join(" ".join(f"{v:.9f}" for v in (t, *p, *q)) for t, p, q in zip(T, XYZ, WXYZ[:, [1, 2, 3, 0]]))
+    )
+    times.write_text("\n".join(map(str, range(30))))
+    words = [
+        "--topic",
+        "a",
+        "--image-topic",
+        "b",
+        "--imu-topic",
+        "c",
+        "--times",
+        times,
+        "--video-start",
+        1,
+        "--agl",
+        9,
+        "--ground",
+        2,
+    ]
+    status, said = command("import", path, "--out", tmp_path / "out", *words)
+    assert status == 0
+    left = [line.split()[0] for line in said.splitlines() if "was left out" in line]
+    assert left == ["--video-start", "--image-topic", "--imu-topic", "--topic", "--times", "--ground"]
+    log = dataflash(tmp_path / "log.bin")
+    status, said = command(
+        "import", log, "--out", tmp_path / "bin", "--format", "tum", "--quaternion", "xyzw"
+    )
+    assert status == 0
+    assert "--format was left out" in said
+    assert "--quaternion was left out" in said
+
+
 def test_kitti_needs_times(tmp_path: Path) -> None:
     path, times = tmp_path / "poses.txt", tmp_path / "times.txt"
     path.write_text("\n".join(f"1 0 0 {0.5 * i} 0 1 0 0 0 0 1 0" for i in range(30)))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 import pytest
+from small_flights import Said
 
 from brmgeo.errors import InputError
 from brmgeo.match import METHODS
@@ -138,3 +139,22 @@ def _texts(tree: ast.AST) -> list[str]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found.append(node.value)
     return found
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("localize --maps MAPS --flight FLIGHT --seed 3 --out OUT", "--seed"),
+        ("simulate --maps MAPS --no-odometry --scale-bias 0.1 --out OUT", "--scale-bias"),
+        ("evaluate --results OUT --methods mask", "--methods"),
+        ("evaluate town --results OUT", r"\[REGION\]"),
+        ("odometry FLIGHT --every 3", "--every"),
+    ],
+)
+def test_an_option_that_another_one_shadows_is_refused(
+    words: str, option: str, say: Callable[..., Said], tmp_path: Path
+) -> None:
+    told = say(*(str(tmp_path) if w.isupper() else w for w in words.split()))
+    assert told.code == 2
+    assert re.match(rf"brmgeo: {words.split()[0]}: {option} .*leave one out|.*both or none", told.line)
+    assert say("evaluate", "--results", tmp_path, "--traceback").line.startswith(f"brmgeo: {tmp_path}")
