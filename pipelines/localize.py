@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from brmgeo.errors import InputError, MissingInputError, SettingsError
 from brmgeo.files import require_replaceable, whole_folder
 from brmgeo.flight.folder import Flight
 from brmgeo.flight.own import own_odometry
+from brmgeo.geo.crs import apart
+from brmgeo.geo.grid import as_bounds
 from brmgeo.locate.flights import locate_flight
 from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import NetworkUse, frame_masks
@@ -65,6 +69,11 @@ def localize(
         if tried.says:
             progress.say(f"{flight.name} odometry: {tried.says}")
     reference = flight.reference(maps.crs)
+    if reference is not None:
+        there = as_bounds((*np.nanmin(reference.xy_m, axis=0), *np.nanmax(reference.xy_m, axis=0)))
+        # No fault: a flight off the map is one that localize must say "lost" of.
+        if line := apart("reference", {flight.name: there}, "the maps", maps.bounds, maps.crs):
+            progress.say(line)
     yaws = flight.compass_yaw_rad(maps.crs, *maps.middle) if compass else None
     if yaws is not None and all(yaw is None for yaw in yaws):
         raise InputError(

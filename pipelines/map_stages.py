@@ -22,6 +22,7 @@ from odc.geo.geobox import GeoBox
 from brmgeo.codes import BUILDING, OTHER, UNKNOWN
 from brmgeo.errors import InputError, SettingsError, listed
 from brmgeo.files import json_of
+from brmgeo.geo.crs import require_meeting
 from brmgeo.geo.grid import Bounds, Window, as_bounds, blocks, bounds_of, gsd_of, lattice, shape_of
 from brmgeo.geo.sheets import check_extent, sheet_polygon
 from brmgeo.workflow.stage import Json, Map, Stage, unstated
@@ -137,6 +138,7 @@ def run_outlines(inputs: Inputs, out: Path, settings: OutlinesSettings, map: Map
         "counts": read.counts,
         "repairs": repair_counts(read.repairs),
         "examples": examples,
+        **({"notes": [f"{name}: {note}" for note in read.notes]} if read.notes else {}),
     }
 
 
@@ -358,10 +360,18 @@ def _imagery_block(
 
 
 def run_buildings(inputs: Inputs, out: Path, settings: RasterSettings, map: Map) -> Json:
-    """Writes buildings.tif: 0, 1, and 255 where the map is not known."""
+    """Writes buildings.tif: 0, 1, and 255 where the map is not known.
+
+    CrsError where no outline lies within the lattice: that would be a map which knows that nothing is built.
+    """
+    import pyogrio
+
     from brmgeo.export.cog import write_cog
 
     box, _ = read_lattice(inputs["lattice"])
+    footprints = inputs["footprints"] / "footprints.gpkg"
+    there = {footprints.name: as_bounds(pyogrio.read_info(footprints, layer="footprints")["total_bounds"])}
+    require_meeting("building outline", there, "the region's bounds", bounds_of(box), str(box.crs))
     windows = list(blocks(shape_of(box), BLOCK_PX))
     work = functools.partial(building_block, inputs["footprints"], inputs["lattice"])
     built = known = 0

@@ -57,6 +57,9 @@ def build_maps(
             scheduler_spec, shared=store.root, log=store.root / "dask.log", say=progress.say
         ) as map:
             made = plan.build(map, progress)
+        for artifact in made.values():
+            for note in artifact.facts.get("notes", ()):
+                progress.say(note)
         if "source" in made:
             publish(made["source"], source_dir, _source_names(made["source"]), progress.say)
         for label, name in PUBLISHED.items():

@@ -7,6 +7,7 @@ declare northing first, and that must be forgotten in one place only.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 
 from pyproj import CRS, Proj, Transformer
@@ -66,6 +67,39 @@ def transform_bounds(src: str, dst: str, bounds: Bounds, densify: int = 21) -> B
     if not all(map(math.isfinite, (left, bottom, right, top))):
         raise CrsError(f"bounds {bounds} in {_short(src)} have no place in {_short(dst)}: check the crs")
     return (float(left), float(bottom), float(right), float(top))
+
+
+def apart(what: str, places: Mapping[str, Bounds], where: str, ground: Bounds, crs: str) -> str | None:
+    """A line that says how far off the nearest is, where none of several boxes meets a ground; None where one does.
+
+    The usual cause is a wrong CRS, or a file of another place.
+
+    Args:
+        what: one of them, in words, such as "image".
+        places: (left, bottom, right, top) of each by its name, in ``crs``; none at all are apart from nothing.
+        where: the ground in words, such as "the region".
+        ground: its (left, bottom, right, top).
+        crs: of all of them.
+    """
+    left, bottom, right, top = ground
+    gaps = {
+        name: math.hypot(max(west - right, left - east, 0.0), max(south - top, bottom - north, 0.0))
+        for name, (west, south, east, north) in places.items()
+    }
+    if not gaps or 0.0 in gaps.values():
+        return None
+    name = min(gaps, key=lambda n: gaps[n])
+    return (
+        f"no {what} lies on {where}: the nearest, {name}, is {gaps[name] / 1000:.1f} km away in {crs_name(crs)}; "
+        f"check its crs and {where}"
+    )
+
+
+def require_meeting(what: str, places: Mapping[str, Bounds], where: str, ground: Bounds, crs: str) -> None:
+    """Raises CrsError with the line of ``apart``, where there is one."""
+    line = apart(what, places, where, ground, crs)
+    if line is not None:
+        raise CrsError(line)
 
 
 def same_crs(a: str, b: str) -> bool:

@@ -29,9 +29,9 @@ from brmgeo.extras import extra
 from brmgeo.files import scratch_folder
 from brmgeo.geo.crs import LONLAT, crs_name, require_projected_metres, same_crs, transformer
 from brmgeo.geo.formats import vector_file
-from brmgeo.geo.grid import Bounds
+from brmgeo.geo.grid import Bounds, as_bounds
 from brmgeo.geo.sheets import check_extent, sheet_at, sheet_number_in, sheet_polygon
-from brmgeo.ingest.dxf import MAX_DROPPED_SHARE, SNAP_M, read_dxf
+from brmgeo.ingest.dxf import MAX_DROPPED_SHARE, SNAP_M, SheetFootprints, read_dxf
 from brmgeo.ingest.groups import grouped
 from brmgeo.ingest.repair import (
     DROPPED_KINDS,
@@ -61,6 +61,10 @@ _TIMES_UNPACKED = 4
 
 _KIND_COLUMNS = ("kind", "종류")
 _FLOOR_COLUMNS = ("floors", "층수", "building:levels")
+# What GDAL, QuickOSM, osmtogeojson and Geofabrik call the identity of an OpenStreetMap object, and where its other keys are.
+_OSM_IDENTITY = {"osm_id", "osm_way_id", "osm_type", "full_id", "@id"}
+_OSM_KEYS = {"other_tags", "fclass", "landuse", "leisure", "amenity"}
+_BUILDING_TAG = r"""["']building["']\s*(?:=>|:)\s*["']([^"']*)["']"""
 
 
 @dataclass(slots=True)
@@ -75,12 +79,14 @@ class Footprints:
             that is known: "neatline", "number" (the sheet number's cell) or "extent" (only the data's bounds).
         repairs: every repair, x and y in the region's CRS.
         counts: facts by name, summed over files, with ``repair_KIND`` for each kind of repair.
+        notes: what a user should know of how the file was read, a line each.
     """
 
     frame: gpd.GeoDataFrame
     sheets: gpd.GeoDataFrame
     repairs: list[Repair] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
 
 def read_footprints(
@@ -276,22 +282,22 @@ def _from_dxf(
     require_projected_metres(crs)
     native = source_crs or crs
     require_projected_metres(native)
-    read = read_dxf(path, layers, snap_m=snap_m, max_dropped_share=max_dropped_share)
     number = sheet or sheet_number_in(path.name) or ""
+    read = read_dxf(path, layers, snap_m=snap_m, max_dropped_share=max_dropped_share)
+    notes = []
+    try:
+        _check_place(read, path.name, native, number)
+    except CrsError as as_metres:
+        if read.drawn_in is None or read.drawn_in[1] == 1.0:
+            raise
+        unit, unit_m = read.drawn_in
+        read = read_dxf(path, layers, snap_m=snap_m, max_dropped_share=max_dropped_share, unit_m=unit_m)
+        try:
+            _check_place(read, path.name, native, number)
+        except CrsError:
+            raise CrsError(f"{as_metres} (nor do they fit in {unit}, which $INSUNITS says)") from None
+        notes.append(f"drawn in {unit} ($INSUNITS), read as metres")
     polygons = np.asarray(read.footprints.geometry.values, dtype=object)
-    numbers = [number] if number else []
-    if read.neatline is not None:
-        check_extent(
-            read.neatline.bounds,
-            native,
-            numbers,
-            f"{path.name} (neatline)",
-            NEATLINE_TOLERANCE_M,
-            neatline=True,
-        )
-    if len(polygons):
-        left, bottom, right, top = map(float, shapely.total_bounds(polygons))
-        check_extent((left, bottom, right, top), native, numbers, path.name)
     neatline = (
         None if read.neatline is None else _moved(np.array([read.neatline], dtype=object), native, crs)[0]
     )
@@ -313,7 +319,19 @@ def _from_dxf(
         repairs=repairs,
         counts=read.counts,
         dropped_share=read.dropped_share,
+        notes=notes,
     )
+
+
+def _check_place(read: SheetFootprints, name: str, crs: str, number: str) -> None:
+    """CrsError where a sheet does not lie where its number and the CRS say."""
+    numbers = [number] if number else []
+    if read.neatline is not None:
+        check_extent(
+            read.neatline.bounds, crs, numbers, f"{name} (neatline)", NEATLINE_TOLERANCE_M, neatline=True
+        )
+    if len(read.footprints):
+        check_extent(as_bounds(read.footprints.total_bounds), crs, numbers, name)
 
 
 def _from_vector(
@@ -338,11 +356,13 @@ def _from_vector(
         )
     target = crs or crs_name(native)
     require_projected_metres(target)
+    frame, notes = _buildings_of(frame, path.name)
     geometry = np.asarray(frame.geometry.values, dtype=object)
     polygons, row, open_rows, other = _polygons_of(geometry, snap_m)
     polygons = _moved(polygons, native, target)
     name = layer or path.stem
-    handles = np.array([str(i + 1) for i in row.tolist()], dtype=object)
+    number = frame.index.to_numpy() + 1
+    handles = number[row].astype(str).astype(object)
     repaired = repair_rings(
         ClosedOutlines(polygons, np.full(len(row), name, dtype=object), handles), path.name, courtyards=False
     )
@@ -355,7 +375,7 @@ def _from_vector(
             else ("unreadable", "empty; dropped")
         )
         x, y = transformer(native, target).transform(*xy[0]) if len(xy) else (math.nan, math.nan)
-        repairs.append(Repair(kind, str(i + 1), name, float(x), float(y), detail, path.name))
+        repairs.append(Repair(kind, str(number[i]), name, float(x), float(y), detail, path.name))
     outlines = len(polygons) + len(open_rows)
     dropped = sum(repair.kind in DROPPED_KINDS for repair in repairs)
     share = dropped / outlines if outlines else 0.0
@@ -364,12 +384,12 @@ def _from_vector(
             f"{path.name}: {dropped} of {outlines} outlines ({share:.0%}) are not usable, {max_dropped_share:.0%} allowed: "
             "mend the file or raise max_dropped_share"
         )
-    number = sheet or _number_of(path)
+    of_sheet = sheet or _number_of(path)
     if len(repaired.polygons):
         left, bottom, right, top = map(float, shapely.total_bounds(repaired.polygons))
-        check_extent((left, bottom, right, top), target, [number] if number else [], path.name)
-        if not number and path.name.upper().startswith("N3A_"):
-            number = _cell_around((left, bottom, right, top), target)
+        check_extent((left, bottom, right, top), target, [of_sheet] if of_sheet else [], path.name)
+        if not of_sheet and path.name.upper().startswith("N3A_"):
+            of_sheet = _cell_around((left, bottom, right, top), target)
     from_row = row[repaired.origin]
     kinds = _kinds(frame)[from_row]
     floors = _floors(frame).iloc[from_row].array
@@ -382,7 +402,7 @@ def _from_vector(
     counts |= {f"repair_{kind}": n for kind, n in repair_counts(repairs).items()}
     return _assembled(
         path.name,
-        number,
+        of_sheet,
         target,
         repaired.polygons,
         columns,
@@ -391,6 +411,7 @@ def _from_vector(
         repairs=repairs,
         counts=counts,
         dropped_share=share,
+        notes=notes,
     )
 
 
@@ -470,6 +491,45 @@ def _with_index(path: Path) -> Iterator[Path]:
         for part in path.parent.glob(f"{path.stem}.*"):
             shutil.copyfile(part, folder / part.name)
         yield folder / path.name
+
+
+def _buildings_of(frame: gpd.GeoDataFrame, name: str) -> tuple[gpd.GeoDataFrame, list[str]]:
+    """The buildings of an OpenStreetMap extract, and a note where it holds other things; other files as they are.
+
+    An extract is known by its columns; its buildings have building=* (a column, in other_tags or in tags), or are of the
+    fclass "building" (Geofabrik). InputError where nothing says which of its features are buildings.
+    """
+    frame = frame.reset_index(drop=True)
+    columns = {str(c).lower(): c for c in frame.columns}
+    if not (_OSM_IDENTITY | _OSM_KEYS) & set(columns):
+        return frame, []
+    said: pd.Series[Any] | None = None
+    by = "building=*"
+    if "building" in columns:
+        said = frame[columns["building"]]
+    elif "fclass" in columns:
+        said, by = frame[columns["fclass"]].where(lambda v: v == "building"), "fclass=building"
+    else:
+        for column in ("other_tags", "tags"):
+            if column in columns:
+                text = frame[columns[column]].astype("string")
+                said = text.str.extract(_BUILDING_TAG)[0]
+    if said is None and not _OSM_KEYS & set(columns):
+        return frame, []  # without any keys somebody has chosen them already
+    words = None if said is None else said.astype("string").str.strip().str.lower()
+    built = np.zeros(len(frame), np.bool_)
+    if words is not None:
+        built = (~words.isin(["", "no", "false", "0"]) & words.notna()).to_numpy(dtype=np.bool_)
+    if len(frame) and not built.any():
+        raise InputError(
+            f"{name}: of an OpenStreetMap extract ({len(frame)} features), and nothing says which of them are buildings "
+            "(building=*, or fclass=building): give its buildings alone"
+        )
+    if built.all():
+        return frame, []
+    return frame[built], [
+        f"{len(frame)} features of OpenStreetMap, {int(built.sum())} of them buildings by {by}"
+    ]
 
 
 def _only_layer(path: Path) -> str:
@@ -633,6 +693,7 @@ def _assembled(
     repairs: list[Repair],
     counts: dict[str, int],
     dropped_share: float,
+    notes: list[str],
 ) -> Footprints:
     n = len(polygons)
     frame = gpd.GeoDataFrame(
@@ -663,4 +724,4 @@ def _assembled(
         geometry=gpd.GeoSeries([place], dtype="geometry"),
         crs=crs,
     )[list(SHEET_COLUMNS)]
-    return Footprints(frame, sheets, repairs, counts)
+    return Footprints(frame, sheets, repairs, counts, notes)

@@ -36,7 +36,15 @@ from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from brmgeo.errors import CrsError, InputError, MissingInputError, one_line
-from brmgeo.geo.crs import belt_for_sheet, crs_name, parse_crs, same_crs, transform_bounds, transformer
+from brmgeo.geo.crs import (
+    belt_for_sheet,
+    crs_name,
+    parse_crs,
+    require_meeting,
+    same_crs,
+    transform_bounds,
+    transformer,
+)
 from brmgeo.geo.formats import open_raster
 from brmgeo.geo.grid import Bounds, Window, bounds_of, gsd_of
 from brmgeo.geo.sheets import is_sheet_number, sheet_extent, sheet_number_in
@@ -127,8 +135,7 @@ def check_imagery(sources: Sequence[ImagerySource], box: GeoBox) -> None:
 
     The message names the nearest file and how far off it is: the usual cause is a wrong CRS.
     """
-    left, bottom, right, top = bounds_of(box)
-    nearest: tuple[float, str, str] | None = None
+    places: dict[str, Bounds] = {}
     for source in sources:
         if not isinstance(source, (GeoRaster, NgiiOrtho)):
             return
@@ -139,19 +146,8 @@ def check_imagery(sources: Sequence[ImagerySource], box: GeoBox) -> None:
             ]
             xs, ys = zip(*corners)
             there = transform_bounds(plane.crs, str(box.crs), (min(xs), min(ys), max(xs), max(ys)))
-        gap = math.hypot(
-            max(there[0] - right, left - there[2], 0.0), max(there[1] - top, bottom - there[3], 0.0)
-        )
-        if gap == 0.0:
-            return
-        if nearest is None or gap < nearest[0]:
-            nearest = (gap, str(source.path), plane.crs)
-    if nearest is not None:
-        gap, name, crs = nearest
-        raise CrsError(
-            f"no image lies on the region: the nearest, {name} in {crs_name(crs)}, is {gap / 1000:.1f} km away; "
-            "check its crs and the region's bounds"
-        )
+            places[f"{source.path} in {crs_name(plane.crs)}"] = there
+    require_meeting("image", places, "the region's bounds", bounds_of(box), str(box.crs))
 
 
 def native_gsd_m(sources: Sequence[ImagerySource], box: GeoBox) -> float:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import InputError, MissingInputError
 from brmgeo.flight.readings import Camera, FloatArray
+from brmgeo.geo.crs import require_meeting
 from brmgeo.geo.formats import vector_file
-from brmgeo.geo.grid import Bounds
+from brmgeo.geo.grid import Bounds, as_bounds
 from brmgeo.geo.raster import read_raster
 from brmgeo.region import FlightSettings
 from brmgeo.synth.flight import (
@@ -84,6 +85,9 @@ def flight_path(path: str, ground: RaisedFootprints, seed: int, bounds: Bounds, 
             f"path {path}: give {', '.join(PATHS)}, or a GeoJSON file with a LineString", needs="path"
         )
     route = path_from_geojson(path, crs)
+    require_meeting(
+        "path", {path: as_bounds((*route.min(axis=0), *route.max(axis=0)))}, "the maps", bounds, crs
+    )
     away = np.maximum(np.array(bounds[:2]) - route, route - np.array(bounds[2:])).max(axis=1)
     if not away.max() <= _FAR_M:
         raise InputError(
@@ -109,13 +113,15 @@ def imagery_along(
 ) -> Imagery:
     """What frames along a (n, 2) route are drawn from: the finer imagery where there is some, else the whole of a raster.
 
-    Raises MissingInputError or InputError where the raster cannot be read.
+    Raises MissingInputError or InputError where the raster cannot be read, CrsError where it does not meet the route.
     """
     if fine is not None:
         reach = settings.agl_m * math.tan(math.radians(_seen_deg(settings)) / 2) * 2.5 + 60.0
         (left, bottom), (right, top) = route.min(axis=0) - reach, route.max(axis=0) + reach
         return Imagery(*fine.around((left, bottom, right, top)), fine.gsd_m)
     picture = read_raster(file)
+    flown = as_bounds((*route.min(axis=0), *route.max(axis=0)))
+    require_meeting("imagery", {str(file): picture.bounds}, "the flight's path", flown, picture.crs)
     return Imagery(np.moveaxis(picture.pixels, 0, -1), picture.left, picture.top, picture.gsd_m)
 
 

@@ -13,11 +13,13 @@ from brmgeo.errors import CrsError
 from brmgeo.geo.crs import (
     BELTS,
     LONLAT,
+    apart,
     belt_for_lon,
     belt_for_sheet,
     convergence_rad,
     crs_name,
     on_old_datum,
+    require_meeting,
     require_projected_metres,
     same_crs,
     transform_bounds,
@@ -120,3 +122,19 @@ def test_no_way_between_two_crs_is_one_line():
     here = 'LOCAL_CS["site grid",UNIT["metre",1]]'
     with pytest.raises(CrsError, match="no transformation leads from site grid to EPSG:5187: state the crs"):
         transformer(here, "EPSG:5187")
+
+
+def test_what_does_not_meet_is_told_with_the_nearest_and_its_distance():
+    ground = (0.0, 0.0, 1000.0, 1000.0)
+    near, far = (4000.0, 5000.0, 5000.0, 6000.0), (-90_000.0, 0.0, -80_000.0, 1000.0)
+    line = apart("image", {"a.tif": far, "b.tif": near}, "the region", ground, "EPSG:5187")
+    assert line == (
+        "no image lies on the region: the nearest, b.tif, is 5.0 km away in EPSG:5187; check its crs and the region"
+    )
+    assert (
+        apart("image", {"a.tif": far, "b.tif": (900.0, 900.0, 2000.0, 2000.0)}, "x", ground, "EPSG:5187")
+        is None
+    )
+    assert apart("image", {}, "x", ground, "EPSG:5187") is None
+    with pytest.raises(CrsError, match=r"the nearest, a\.tif, is 80\.0 km away"):
+        require_meeting("image", {"a.tif": far}, "x", ground, "EPSG:5187")

@@ -100,6 +100,83 @@ def test_a_flatgeobuf_that_was_cut_is_refused(tmp_path):
     assert "t.fgb: cut short or damaged: 39 of its 40 features are there: fetch the file again" in told
 
 
+def osm(rows, **columns):
+    """Squares with attributes as an OpenStreetMap extract has them."""
+    left, bottom, *_ = sheet_extent(NUMBER, CRS)
+    squares = [shapely.box(x, bottom + 300, x + 10, bottom + 310) for x in left + 300 + 30 * np.arange(rows)]
+    return gpd.GeoDataFrame(columns, geometry=squares, crs=CRS)
+
+
+@pytest.mark.parametrize(
+    ("by", "columns"),
+    [
+        ("building=*", {"osm_id": ["1", "2", "3", "4"], "building": ["yes", None, "no", "house"]}),
+        ("building=*", {"@id": ["w1", "w2", "w3", "w4"], "Building": ["yes", "", None, "roof"], "landuse": [None] * 4}),
+        ("building=*", {"osm_id": ["1", "2", "3", "4"],
+                        "other_tags": ['"building"=>"yes"', '"landuse"=>"forest"', None, '"a"=>"b","building"=>"x"']}),
+        ("fclass=building", {"osm_id": ["1", "2", "3", "4"], "fclass": ["building", "forest", "park", "building"]}),
+        ("building=*", {"@id": ["1", "2", "3", "4"],
+                        "tags": ['{"building": "yes"}', '{"leisure": "park"}', "{}", '{ "building": "x" }']}),
+    ],
+)  # fmt: skip
+def test_of_an_openstreetmap_extract_only_buildings_are_buildings(tmp_path, by, columns):
+    read = read_footprints(write(osm(4, **columns), tmp_path / "t.gpkg"), CRS)
+    assert list(read.frame.handle) == ["1", "4"]
+    assert read.notes == [f"4 features of OpenStreetMap, 2 of them buildings by {by}"]
+    for n, other in enumerate(
+        (town(4), osm(4, osm_id=["1", "2", "3", "4"]), osm(4, building=["a", None, "b", "c"]))
+    ):
+        plain = read_footprints(write(other, tmp_path / f"other{n}.gpkg"), CRS)
+        assert (len(plain.frame), plain.notes) == (4, [])
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [{"osm_id": ["1", "2"], "landuse": ["forest", "park"]}, {"osm_id": ["1", "2"], "building": [None, "no"]},
+     {"osm_id": ["1", "2"], "fclass": ["forest", "park"]}],
+)  # fmt: skip
+def test_an_extract_that_says_nothing_of_buildings_is_refused(tmp_path, columns):
+    with pytest.raises(InputError, match=r"t.gpkg: of an OpenStreetMap extract \(2 features\)"):
+        read_footprints(write(osm(2, **columns), tmp_path / "t.gpkg"), CRS)
+
+
+def drawing(path, unit, scale, place):
+    """Four houses of 10 x 8 m at ``place``, drawn ``scale`` times as large, in $INSUNITS ``unit``."""
+    document = ezdxf.new("R2010", units=unit)
+    for k in range(4):
+        x, y = place[0] + 20 * k, place[1]
+        ring = [(x, y), (x + 10, y), (x + 10, y + 8), (x, y + 8)]
+        document.modelspace().add_lwpolyline(
+            [(scale * a, scale * b) for a, b in ring], close=True, dxfattribs={"layer": "B0014112"}
+        )
+    document.modelspace().add_circle(
+        (scale * (place[0] + 100), scale * place[1]), scale * 5, dxfattribs={"layer": "B0014112"}
+    )
+    document.saveas(path)
+    return path
+
+
+def test_a_drawing_in_millimetres_is_read_as_metres_where_that_fits(tmp_path):
+    left, bottom, *_ = sheet_extent(NUMBER, CRS)
+    place = (left + 300, bottom + 300)
+    metres = read_footprints(drawing(tmp_path / "a.dxf", 6, 1, place), CRS)
+    for unit, scale, name in ((4, 1000, "millimetres"), (5, 100, "centimetres"), (2, 1 / 0.3048, "feet")):
+        read = read_footprints(drawing(tmp_path / f"{NUMBER}_{unit}.dxf", unit, scale, place), CRS)
+        assert read.notes == [f"drawn in {name} ($INSUNITS), read as metres"]
+        assert read.frame.area.to_numpy() == pytest.approx(metres.frame.area.to_numpy(), rel=1e-6)
+        assert read.frame.total_bounds == pytest.approx(metres.frame.total_bounds, abs=1e-3)
+    # Templates say millimetres, and surveyors draw in metres all the same.
+    read = read_footprints(drawing(tmp_path / "template.dxf", 4, 1, place), CRS)
+    assert read.notes == []
+    assert read.frame.total_bounds == pytest.approx(metres.frame.total_bounds, abs=1e-6)
+
+
+def test_a_drawing_that_fits_in_no_unit_names_its_own(tmp_path):
+    path = drawing(tmp_path / f"{NUMBER}.dxf", 4, 1000, (0.0, 0.0))
+    with pytest.raises(CrsError, match=r"nor do they fit in millimetres, which \$INSUNITS says"):
+        read_footprints(path, CRS)
+
+
 def test_floors_are_read_out_of_text(tmp_path):
     frame = town(4).rename(columns={"종류": "Kind"})
     frame["층수"] = ["3층", None, "x", "12"]

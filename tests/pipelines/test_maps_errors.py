@@ -51,6 +51,16 @@ def empty_dxf(path: Path) -> None:
 # --- sheets ---------------------------------------------------------------------------------------------------
 
 
+def test_footprints_beside_the_bounds(built: SmallRegion, tmp_path: Path, capsys: Capture) -> None:
+    left, bottom, right, top = BOUNDS
+    words = ("--crs", CRS, "--gsd", "2", "--bounds", f"{left + 9e4},{bottom},{right + 9e4},{top}")
+    answer = brmgeo(
+        capsys, "maps", "--footprints", built.out / "footprints.gpkg", *words, "--out", tmp_path / "out"
+    )
+    says(answer, "no building outline lies on the region's bounds", "km away in EPSG:5187; check its crs")
+    assert not (tmp_path / "out" / "buildings.tif").exists()
+
+
 def test_truncated_sheet(region: SmallRegion, maps: Callable[[], Answer]) -> None:
     sheet = region.sheets / f"{SECOND}.dxf"
     whole = sheet.read_bytes()

@@ -334,7 +334,7 @@ def test_imagery_beside_the_region_is_told(tiled: SmallRegion, tmp_path: Path, c
     shape = {"width": 64, "height": 64, "count": 3, "dtype": "uint8", "crs": CRS, "transform": far}
     with rasterio.open(region.tiles.parent / "far.tif", "w", driver="GTiff", **shape) as out:
         out.write(np.full((3, 64, 64), 90, np.uint8))
-    assert "no image lies on the region: the nearest" in cut(capsys, region).error
+    assert "no image lies on the region's bounds: the nearest" in cut(capsys, region).error
 
 
 def test_a_held_out_region_far_away_stops_none(tiled: SmallRegion, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,7 @@ from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, 
 from brmgeo.errors import InputError, SettingsError
 from brmgeo.extras import extra
 from brmgeo.ingest.dxf.chains import DrawnRings, close
-from brmgeo.ingest.dxf.entities import block_lines, in_modelspace, lines_on
+from brmgeo.ingest.dxf.entities import MIN_BLOCK_AREA_M2, block_lines, in_modelspace, lines_on
 from brmgeo.ingest.dxf.tags import Tags, text_of
 from brmgeo.ingest.repair import DROPPED_KINDS, ClosedOutlines, Repair, repair_counts, repair_rings
 
@@ -46,6 +46,13 @@ SNAP_M = 0.10
 SAGITTA_M = 0.01
 MAX_DROPPED_SHARE = 0.05
 MAX_BLOCK_USES = 2
+# Of $INSUNITS, as the DXF reference numbers them.
+_UNITS = {
+    "1": ("inches", 0.0254), "2": ("feet", 0.3048), "3": ("miles", 1609.344), "4": ("millimetres", 0.001),
+    "5": ("centimetres", 0.01), "6": ("metres", 1.0), "7": ("kilometres", 1000.0), "10": ("yards", 0.9144),
+    "14": ("decimetres", 0.1), "15": ("decametres", 10.0), "16": ("hectometres", 100.0),
+    "21": ("US survey feet", 1200.0 / 3937.0),
+}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -61,6 +68,7 @@ class SheetFootprints:
         counts: facts by name: outlines, footprints, courtyards, z_dropped, bulges, chained, blocks_as_buildings,
             symbols_ignored, other_entities (on wanted layers, not outlines) and one ``repair_KIND`` a kind.
         dropped_share: outlines dropped / outlines found, in [0, 1].
+        drawn_in: the unit that $INSUNITS names, in words, and its metres; None where it names none.
     """
 
     footprints: gpd.GeoDataFrame
@@ -68,6 +76,7 @@ class SheetFootprints:
     repairs: list[Repair] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     dropped_share: float = 0.0
+    drawn_in: tuple[str, float] | None = None
 
 
 def read_dxf(
@@ -78,6 +87,7 @@ def read_dxf(
     sagitta_m: float = SAGITTA_M,
     max_dropped_share: float = MAX_DROPPED_SHARE,
     max_block_uses: int = MAX_BLOCK_USES,
+    unit_m: float = 1.0,
 ) -> SheetFootprints:
     """The building outlines of one DXF sheet; see the module for what counts as one.
 
@@ -88,6 +98,8 @@ def read_dxf(
         sagitta_m: chords that replace an arc stay within this of it, metres.
         max_dropped_share: share of outlines that may be dropped before the sheet is refused, in [0, 1].
         max_block_uses: blocks used more often than this are symbols; 0 takes no block for a building.
+        unit_m: metres of the unit that it is drawn in; what $INSUNITS says is told (``drawn_in``), not believed, because
+            templates set it and surveyors draw in metres all the same.
 
     A sheet without buildings gives no footprints and is no error. Raises InputError, in one line, for a file that is no DXF,
     is cut short, is damaged (with the line number), or loses more outlines than allowed; SettingsError for layer B0014119,
@@ -101,9 +113,12 @@ def read_dxf(
             "give snap_m >= 0, sagitta_m > 0 and a share in [0, 1]"
         )
     tags = Tags(text_of(path), path.name)
-    drawn = _draw(tags, wanted, snap_m, sagitta_m, max_block_uses)
+    drawn = _draw(tags, wanted, snap_m / unit_m, sagitta_m / unit_m, max_block_uses, unit_m)
+    drawn.repairs = [replace(r, x=unit_m * r.x, y=unit_m * r.y) for r in drawn.repairs]
 
-    rings = ClosedOutlines(drawn.polygons(), _objects(drawn.layers), _objects(drawn.handles))
+    rings = ClosedOutlines(
+        _in_metres(drawn.polygons(), unit_m), _objects(drawn.layers), _objects(drawn.handles)
+    )
     repaired = repair_rings(rings, path.name)
     repairs = sorted(drawn.repairs + repaired.repairs, key=lambda r: (r.kind, r.layer, r.handle, r.x, r.y))
     layer = rings.layers[repaired.origin]
@@ -133,7 +148,23 @@ def read_dxf(
             f"first: {worst.kind} on {worst.layer}, handle {worst.handle or '?'}, at {worst.x:.2f}, {worst.y:.2f}: "
             "mend the sheet or raise max_dropped_share"
         )
-    return SheetFootprints(frame, _neatline(tags, snap_m, sagitta_m), repairs, counts, share)
+    neatline = _neatline(tags, snap_m / unit_m, sagitta_m / unit_m)
+    if neatline is not None:
+        neatline = _in_metres(np.array([neatline], dtype=object), unit_m)[0]
+    return SheetFootprints(frame, neatline, repairs, counts, share, _unit(tags))
+
+
+def _in_metres(polygons: NDArray[np.object_], unit_m: float) -> NDArray[np.object_]:
+    return polygons if unit_m == 1.0 else np.asarray(shapely.transform(polygons, lambda xy: unit_m * xy))
+
+
+def _unit(tags: Tags) -> tuple[str, float] | None:
+    """The unit of the header's $INSUNITS in words, and its metres."""
+    rows = np.flatnonzero(tags.codes[: int(tags.heads[min(2, len(tags.heads) - 1)])] == 9)
+    for row in rows.tolist():
+        if tags.value(row) == b"$INSUNITS":
+            return _UNITS.get(tags.value(row + 1).decode("ascii", errors="replace"))
+    return None
 
 
 def _wanted_layers(layers: Sequence[str]) -> dict[bytes, str]:
@@ -167,15 +198,16 @@ def _escaped(name: str) -> bytes:
 
 
 def _draw(
-    tags: Tags, wanted: dict[bytes, str], snap_m: float, sagitta_m: float, max_block_uses: int
+    tags: Tags, wanted: dict[bytes, str], snap: float, sagitta: float, max_block_uses: int, unit_m: float
 ) -> DrawnRings:
-    """Closed outlines on the wanted layers of modelspace."""
+    """Closed outlines on the wanted layers of modelspace, in drawing units as ``snap`` and ``sagitta`` are."""
     assert tags.entities is not None
     drawn = DrawnRings(counts=dict.fromkeys(("z_dropped", "bulges", "chained"), 0))
     heads = in_modelspace(tags, np.arange(*tags.entities))
-    lines = lines_on(tags, heads, wanted, sagitta_m, drawn.counts)
-    lines += block_lines(tags, heads, wanted, snap_m, sagitta_m, max_block_uses, drawn.counts)
-    close(lines, wanted, snap_m, drawn, tags.name)
+    lines = lines_on(tags, heads, wanted, sagitta, drawn.counts)
+    least = MIN_BLOCK_AREA_M2 / unit_m**2
+    lines += block_lines(tags, heads, wanted, snap, sagitta, max_block_uses, least, drawn.counts)
+    close(lines, wanted, snap, drawn, tags.name)
     return drawn
 
 

@@ -284,6 +284,7 @@ def block_lines(
     snap_m: float,
     sagitta_m: float,
     max_block_uses: int,
+    least_area: float,
     counts: dict[str, int],
 ) -> list[Line]:
     """Outlines of the block references that are buildings (see the module); counts those and the symbols."""
@@ -306,7 +307,7 @@ def block_lines(
         area = sum(
             shapely.Polygon(line.xy).area for line in solid if len(line.xy) >= 3 and line.is_shut(snap_m)
         )
-        if area >= MIN_BLOCK_AREA_M2:
+        if area >= least_area:
             out += solid
             taken += 1
     counts["blocks_as_buildings"], counts["symbols_ignored"] = taken, len(inserts) - taken
