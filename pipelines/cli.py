@@ -458,7 +458,7 @@ def why(region: str, stage: str, data: Path) -> None:
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option(
     "--count",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 100_000),
     help="Simulate this many flights, with seeds from --seed on, side by side; --out is then the folder of their folders.",
 )
 @click.option(
@@ -700,7 +700,7 @@ def localize(
     "--results", type=DATA, multiple=True, help="Compare what localize wrote below this folder; repeatable."
 )
 @click.option(
-    "--flights", type=click.IntRange(min=1), default=50, show_default=True, help="Simulated flights."
+    "--flights", type=click.IntRange(1, 100_000), default=50, show_default=True, help="Simulated flights."
 )
 @click.option("--first-seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--methods", default=",".join(METHODS), show_default=True)

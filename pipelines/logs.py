@@ -48,7 +48,13 @@ def import_log(path: Path, out: Path, settings: ImportSettings | None = None) ->
                 raise FlightError(
                     f"{path}: the flight is not complete: {str(error).replace(str(work), str(out))}"
                 ) from None
-    return [*flight.says, *_left_out(log, settings), *log.notes, *log.faults, *dropouts(log)]
+    return [
+        *flight.says,
+        *_left_out(log, settings, pictures is None),
+        *log.notes,
+        *log.faults,
+        *dropouts(log),
+    ]
 
 
 def _write_pictures(work: Path, pictures: Pictures, names: dict[int, str]) -> None:
@@ -59,13 +65,15 @@ def _write_pictures(work: Path, pictures: Pictures, names: dict[int, str]) -> No
         folder.rmdir()
 
 
-def _left_out(log: Log, settings: ImportSettings) -> list[str]:
-    # Options that this log or video has no use for.
+def _left_out(log: Log, settings: ImportSettings, blind: bool) -> list[str]:
+    # Options that this log or video has no use for; ``blind``: there are no pictures.
     options, video, photos = settings.options, settings.video is not None, settings.photos is not None
     bag, text = log.kind == "rosbag", log.kind not in ("rosbag", "ulog", "ardupilot", "mavlink", "photos")
     gimbal = "the photos tell the camera's own attitude (gimbal), so it has none"
     unused = (
         ("--mount", is_of_camera(log) and any(settings.mount_deg), gimbal),
+        ("--mount", blind and any(settings.mount_deg), "there are no pictures"),
+        ("--shift-frames", blind and settings.shift_frames_s, "there are no pictures"),
         ("--shift-frames", video and settings.shift_frames_s, "with --video, --video-start says when its frames were taken"),
         ("--video-start", not video and settings.video_start_s, "there is no --video"),
         ("--photos", video and photos, "the pictures are those of --video"),
@@ -76,6 +84,10 @@ def _left_out(log: Log, settings: ImportSettings) -> list[str]:
         ("--format", options.format and not text, "this is no text of poses"),
         ("--quaternion", options.quaternion and not text, "this is no text of poses"),
         ("--times", options.frame_times_s is not None and log.kind != "kitti", "the log tells its own"),
+        ("--camera", blind and settings.camera is not None, "there are no pictures"),
+        ("--fov", blind and settings.fov_deg is not None, "there are no pictures"),
+        ("--agl", blind and settings.agl_m is not None, "there are no pictures"),
+        ("--rate", blind and settings.rate_hz is not None, "there are no pictures"),
         ("--ground", settings.agl_m is not None and settings.ground_m is not None, "--agl tells the height"),
     )  # fmt: skip
     return [f"{option} was left out: {why}" for option, is_so, why in unused if is_so]

@@ -228,7 +228,15 @@ def test_options_that_a_log_has_no_use_for_are_told(tmp_path: Path) -> None:
     status, said = command("import", path, "--out", tmp_path / "out", *words)
     assert status == 0
     left = [line.split()[0] for line in said.splitlines() if "was left out" in line]
-    assert left == ["--video-start", "--image-topic", "--imu-topic", "--topic", "--times", "--ground"]
+    assert left == [
+        "--video-start",
+        "--image-topic",
+        "--imu-topic",
+        "--topic",
+        "--times",
+        "--agl",
+        "--ground",
+    ]
     log = dataflash(tmp_path / "log.bin")
     status, said = command(
         "import", log, "--out", tmp_path / "bin", "--format", "tum", "--quaternion", "xyzw"

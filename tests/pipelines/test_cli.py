@@ -158,3 +158,12 @@ def test_an_option_that_another_one_shadows_is_refused(
     assert told.code == 2
     assert re.match(rf"brmgeo: {words.split()[0]}: {option} .*leave one out|.*both or none", told.line)
     assert say("evaluate", "--results", tmp_path, "--traceback").line.startswith(f"brmgeo: {tmp_path}")
+
+
+@pytest.mark.parametrize(
+    "words", ["simulate --maps OUT --out OUT --count", "evaluate --maps OUT --out OUT --flights"]
+)
+def test_flights_without_end_are_refused(words: str, say: Callable[..., Said], tmp_path: Path) -> None:
+    told = say(*(tmp_path if w == "OUT" else w for w in words.split()), 10**9)
+    assert told.code == 2
+    assert "is not in the range 1<=x<=100000" in told.err
