@@ -19,6 +19,7 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from brmgeo.errors import InputError, MissingInputError
 from brmgeo.files import told
+from brmgeo.memory import require_memory
 
 # GDAL would ask the host that a GML file names for its schema.
 os.environ.setdefault("GML_DOWNLOAD_SCHEMA", "NO")
@@ -140,6 +141,11 @@ def _require_own_crs(text: bytes | mmap.mmap, name: str) -> None:
 def _require_shapes_inside(path: Path) -> None:
     try:
         with zipfile.ZipFile(path) as packed:
+            require_memory(
+                sum(info.file_size for info in packed.infolist()),
+                f"{path.name}, unpacked,",
+                "unpack it and cut out the area that you need",
+            )
             for info in packed.infolist():
                 suffix = Path(info.filename).suffix.lower()
                 if info.is_dir() or suffix in _BESIDE:

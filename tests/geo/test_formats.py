@@ -17,6 +17,7 @@ import shapely
 from affine import Affine
 from small_flights import CRS, LEFT, TOP, Said
 
+from brmgeo import memory
 from brmgeo.errors import InputError, MissingInputError
 from brmgeo.geo.formats import open_raster, raster_driver, vector_file
 from brmgeo.ingest.footprints import read_footprints
@@ -101,6 +102,16 @@ def test_a_pointer_in_an_archive_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as packed:
         packed.writestr("x.shp", _pointers("http://127.0.0.1:1")["OGR VRT"])
     with pytest.raises(InputError, match="points to other sources"):
+        vector_file(tmp_path / "x.zip")
+
+
+def test_an_archive_that_unpacks_to_more_than_there_is_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with zipfile.ZipFile(tmp_path / "x.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("x.geojson", b"{" + b" " * 1_000_000 + b"}")
+    monkeypatch.setattr(memory, "free_bytes", lambda: 500_000)
+    with pytest.raises(InputError, match=r"x\.zip, unpacked, takes"):
         vector_file(tmp_path / "x.zip")
 
 
