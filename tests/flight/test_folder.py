@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -195,9 +196,9 @@ def test_a_video_stands_in_for_the_frames(folder: Path, monkeypatch: pytest.Monk
         assert flight.image(i).mean() == pytest.approx(80 * i, abs=4)
     video = Video(folder / "flight.avi")
     assert not video.is_open
-    opened: list[str] = []
-    real = cv2.VideoCapture
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or real(name))
+    opened: list[Path] = []
+    real = av.open
+    monkeypatch.setattr(av, "open", lambda file, **options: opened.append(file) or real(file, **options))
     for i in range(31):
         assert video.image(i) is not None
     assert len(opened) == 1, "in order, each picture is decoded once"
@@ -221,6 +222,56 @@ def test_a_video_stands_in_for_the_frames(folder: Path, monkeypatch: pytest.Monk
     (folder / "flight.avi").write_bytes(b"no video")
     with pytest.raises(FlightError, match="no readable video"):
         read_flight(folder)
+
+
+def film(path: Path, codec: str, pictures: list[np.ndarray]) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.codec_context.gop_size = 15
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def attempt(video: Video, number: int) -> np.ndarray | None:
+    try:
+        return video.image(number)
+    except FlightError:
+        return None
+
+
+@pytest.mark.parametrize(("name", "codec", "least"), [("f.mp4", "libx264", 0.8), ("f.avi", "mpeg4", 0.6)])
+def test_pictures_that_a_videos_decoder_complains_of_are_told(
+    tmp_path: Path, name: str, codec: str, least: float
+) -> None:
+    rng = np.random.default_rng(3)
+    ground = cv2.GaussianBlur(rng.integers(0, 255, (240, 500, 3)).astype(np.uint8), (0, 0), 3)
+    ground = cv2.normalize(ground, None, 0, 255, cv2.NORM_MINMAX)
+    path = tmp_path / name
+    film(path, codec, [np.ascontiguousarray(ground[40:200, 5 * i : 5 * i + 240]) for i in range(30)])
+    video = Video(path)
+    assert (video.count, video.rate_hz, video.size) == (30, 10.0, (240, 160))
+    whole = [video.image(i) for i in range(30)]
+    capture = cv2.VideoCapture(str(path))
+    assert all(np.array_equal(image, capture.read()[1][:, :, ::-1]) for image in whole)
+    data = path.read_bytes()
+    wrong = {"told": 0, "taken": 0}
+    for _ in range(10):
+        damaged = bytearray(data)
+        for at in rng.integers(len(data) // 8, len(data) * 7 // 8, 3):
+            damaged[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        video = Video(path)
+        found = [attempt(video, i) for i in range(30)]
+        wrong["told"] += sum(image is None for image in found)
+        wrong["taken"] += sum(
+            bool((np.abs(image.astype(int) - true).max(axis=2) > 16).mean() > 0.02)
+            for image, true in zip(found, whole)
+            if image is not None
+        )
+    assert wrong["told"] > least * (wrong["told"] + wrong["taken"])
 
 
 LENS = "fx = 20.0\nfy = 20.0\ncx = 15.5\ncy = 11.5\ndistortion = "

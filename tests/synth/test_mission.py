@@ -81,7 +81,9 @@ def test_ground_and_imagery_of_maps_lie_where_the_maps_do(maps: Path) -> None:
     # Houses stand from 10 m within the maps on, and are 25 m long at most.
     assert np.abs(np.array([west - left, south - bottom, east - right, north - top])).max() < 25
     assert set(ground.height_m) == {3.0, 6.0, 9.0, 12.0}
-    drawn = imagery_along(np.array([[left, bottom], [right, top]]), simulator_settings(FlightSettings()), built.imagery)
+    drawn = imagery_along(
+        np.array([[left, bottom], [right, top]]), simulator_settings(FlightSettings()), built.imagery
+    )
     assert (drawn.left, drawn.top, drawn.gsd_m) == (left, top, 0.5)
     assert drawn.rgb.shape == (*built.ground.building.shape, 3)
 
