@@ -33,7 +33,7 @@ class Video:
         self._next = 0
         stream = self._opened()
         self.rate_hz = float(stream.average_rate)
-        seconds = (self._container.duration or 0) / 1e6
+        seconds = (stream.container.duration or 0) / 1e6
         self.count = int(stream.frames) or round(seconds * self.rate_hz)
         first = next(self._pictures, None)
         self.size = (stream.width, stream.height) if first is None else (first.shape[1], first.shape[0])
