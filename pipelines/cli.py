@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 from click.core import ParameterSource
@@ -977,10 +977,8 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
 )
 @click.option(
     "--axes",
-    type=click.Choice(["flu", "optical"]),
-    default="flu",
-    show_default=True,
-    help="Axes of the odometry.",
+    type=click.Choice(["flu", "frd", "optical", "nadir"]),
+    help="Axes of the odometry: x nose, y left, z up; right-down; of a camera that looks ahead; of one that looks down.",
 )
 @click.option("--imu-units", help="Units of the log's IMU where they are others: deg/s, g or mg, by commas.")
 @click.option(
@@ -1011,7 +1009,7 @@ def import_(
     ground_m: float | None,
     mount_deg: tuple[float, ...],
     body_deg: tuple[float, ...],
-    axes: str,
+    axes: Literal["flu", "frd", "optical", "nadir"] | None,
     imu_units: str | None,
     rate_hz: float | None,
     shift_frames_s: float,

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from brmgeo.errors import InputError, MissingInputError, SettingsError
+from brmgeo.errors import FlightError, InputError, MissingInputError, SettingsError
 from brmgeo.files import require_replaceable, whole_folder
+from brmgeo.flight.checks import mirrored_m
 from brmgeo.flight.folder import Flight
 from brmgeo.flight.own import own_odometry
+from brmgeo.flight.readings import Reference
 from brmgeo.geo.crs import apart
 from brmgeo.geo.grid import as_bounds
 from brmgeo.locate.flights import locate_flight
@@ -74,6 +76,8 @@ def localize(
         # No fault: a flight off the map is one that localize must say "lost" of.
         if line := apart("reference", {flight.name: there}, "the maps", maps.bounds, maps.crs):
             progress.say(line)
+        if flight.odometry is not None:
+            _require_unmirrored(flight, reference)
     yaws = flight.compass_yaw_rad(maps.crs, *maps.middle) if compass else None
     if yaws is not None and all(yaw is None for yaw in yaws):
         raise InputError(
@@ -112,3 +116,23 @@ def localize(
     report = out / "report.html"
     progress.say(f"{flight.name} by {method}: {results.sentence}; report: {report}")
     return report
+
+
+def _require_unmirrored(flight: Flight, reference: Reference) -> None:
+    """FlightError where the odometry agrees with the reference only if it is mirrored."""
+    assert flight.odometry is not None
+    times = flight.times_s
+    true, told = (
+        reference.at(times),
+        np.stack([np.interp(times, flight.odometry.t_s, v) for v in flight.odometry.xyz_m[:, :2].T], axis=-1),
+    )
+    known = np.isfinite(true).all(axis=1)
+    if known.sum() < 10:
+        return
+    as_it_is, mirrored = mirrored_m(told[known], true[known])
+    if as_it_is > 5.0 and mirrored < 0.25 * as_it_is:
+        raise FlightError(
+            f"{flight.folder}: the odometry is mirrored: {as_it_is:.0f} m from the reference after the best turn, scale and "
+            f"shift, and {mirrored:.1f} m when mirrored; its z axis points down: say so with axes in [odometry] of "
+            "flight.toml (nadir for a camera that looks down, else frd), or import it again with them"
+        )

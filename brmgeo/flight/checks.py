@@ -7,14 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from brmgeo.codes import GRAVITY_M_S2
-from brmgeo.flight.frames import inverse, multiply
+from brmgeo.flight.frames import inverse, multiply, rotate
 from brmgeo.flight.motion import RESET_SPEED_M_S, breaks
 from brmgeo.flight.readings import FloatArray, Imu, Odometry
 
 #: Correlation of two turn rates from which their lag is believed.
 MIN_CORRELATION = 0.6
+#: Text formats that do not say how the axes of their tracks lie.
+AXES_UNTOLD = ("tum", "euroc", "vins-mono", "vins-fusion")
+#: Correlation of leaning and acceleration from which up and down are told apart.
+MIN_LEANING = 0.3
+#: Mean share of the way along one axis of the body that counts as flying along it.
+MIN_ALONG = 0.7
 #: Rest lies within these of standard gravity; a handheld or flying one too, in the median.
 _GRAVITY = {"m/s2": GRAVITY_M_S2, "g": 1.0, "mg": 1000.0}
 
@@ -163,3 +170,87 @@ def _nearest(t_s: FloatArray, at_s: FloatArray) -> NDArray[np.int64]:
     left = right - 1
     right = np.minimum(right, len(t_s) - 1)
     return np.asarray(np.where(at_s - t_s[left] <= t_s[right] - at_s, left, right), dtype=np.int64)
+
+
+def leaning(odometry: Odometry) -> float | None:
+    """Correlation of a track's horizontal acceleration with the way that its z axis leans, in [-1, 1].
+
+    What flies by thrust or lift leans to where it accelerates: well above 0 where z points up, well below where it points
+    down, so that the track is mirrored. The track's scale does not matter. None for less than 20 s, or where nothing leans
+    or turns (a straight course, a stabilised camera).
+    """
+    step, smooth, slow = 0.1, 5.0, 20.0
+    at = np.arange(odometry.t_s[0], min(odometry.t_s[-1], odometry.t_s[0] + 3600.0), step)
+    if len(at) < 200:
+        return None
+
+    def quick(values: FloatArray) -> FloatArray:
+        even = np.stack([np.interp(at, odometry.t_s, v) for v in values.T], axis=-1)
+        return np.asarray(gaussian_filter1d(even, smooth, axis=0))
+
+    def fast(values: FloatArray) -> FloatArray:
+        return np.asarray(values - gaussian_filter1d(values, slow, axis=0))
+
+    lean = fast(quick(rotate(odometry.wxyz, np.array([0.0, 0.0, 1.0]))[:, :2]))
+    way = quick(odometry.xyz_m[:, :2])
+    push = fast(np.gradient(np.gradient(way, step, axis=0), step, axis=0))
+    size = float(np.sqrt((lean**2).sum() * (push**2).sum()))
+    parts = [float(part.sum()) for part in np.array_split((lean * push).sum(axis=1), 20)]
+    mean, error = float(np.mean(parts)), float(np.std(parts)) / np.sqrt(20.0)
+    if np.sqrt((lean**2).sum(axis=1).mean()) < 1e-3 or abs(mean) < 1.5 * error:
+        return None
+    return 20.0 * mean / size
+
+
+def along_body(odometry: Odometry) -> FloatArray:
+    """(2,) mean direction of the horizontal way in the body's x and y; its length is 1 where it never changes.
+
+    Only where the track moves at more than a third of its median speed.
+    """
+    steps = np.diff(odometry.xyz_m, axis=0) / np.diff(odometry.t_s)[:, None]
+    speed = np.hypot(steps[:, 0], steps[:, 1])
+    moving = speed > max(float(np.median(speed)) / 3.0, 1e-9)
+    if not moving.any():
+        return np.zeros(2)
+    ahead = rotate(inverse(odometry.wxyz[:-1][moving]), steps[moving])[:, :2]
+    return np.asarray((ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)).mean(axis=0))
+
+
+def doubtful_axes(odometry: Odometry) -> str:
+    """What speaks against a track in x nose, y left, z up, and the axes to give; empty where nothing does.
+
+    A monocular SLAM's track begins as the world of its first camera. Of one that looks down the z axis points down all the
+    way, and nothing but leaning, and the axis that it flies along, tells it from a body whose z axis points up.
+    """
+    lean = leaning(odometry)
+    if lean is not None and lean > MIN_LEANING:
+        return ""
+    x, y = along_body(odometry).tolist()
+    camera = abs(y) > MIN_ALONG
+    if lean is not None and lean < -MIN_LEANING:
+        axes = "nadir (a camera that looks down)" if camera else "frd, or nadir (a camera that looks down)"
+        return (
+            "it leans away from where it accelerates, so its z axis points down, and read as z up it would be mirrored: "
+            f"give axes {axes}; flu keeps it as it is"
+        )
+    own_world = not odometry.xyz_m[0].any() and abs(abs(float(odometry.wxyz[0, 0])) - 1.0) < 1e-9
+    if camera or (own_world and abs(x) < MIN_ALONG):
+        what = "it flies along its y axis" if camera else "it begins as its own world"
+        return (
+            f"{what}, as the track of a camera that looks down does, whose z axis points down: give axes nadir, or "
+            "flu where x is the nose, y left and z up"
+        )
+    return ""
+
+
+def mirrored_m(xy_m: FloatArray, reference_m: FloatArray) -> tuple[float, float]:
+    """Root mean squares of what is left between two plane tracks (n, 2) after the best turn, scale and shift, metres: as
+    they are, and with the first mirrored (Umeyama, "Least-squares estimation of transformation parameters", 1991)."""
+    a, b = ((v - v.mean(axis=0)) @ [1.0, 1j] for v in (xy_m, reference_m))
+    size = float((np.abs(a) ** 2).sum())
+
+    def left(track: NDArray[np.complex128]) -> float:
+        turn = (np.conj(track) * b).sum() / max(size, 1e-12)
+        return float(np.sqrt((np.abs(b - turn * track) ** 2).mean()))
+
+    return left(a), left(np.conj(a))

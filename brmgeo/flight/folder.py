@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
-from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError
+from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError, listed
 from brmgeo.files import digest, json_of, read_json
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
+from brmgeo.flight.checks import AXES_UNTOLD, doubtful_axes
+from brmgeo.flight.frames import Axes
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
 from brmgeo.flight.tables import Table, read_table, read_times, refuse
@@ -46,7 +48,7 @@ _KEYS: dict[str, dict[str, type]] = {
     | dict.fromkeys(("fov_deg", "fx", "fy", "cx", "cy"), float),
     "mount": {"roll_deg": float, "pitch_deg": float, "yaw_deg": float},
     "frames": {"video": str, "start_s": float},
-    "odometry": dict.fromkeys(("file", "format", "quaternion", "topic", "times", "covariance"), str),
+    "odometry": dict.fromkeys(("file", "format", "quaternion", "axes", "topic", "times", "covariance"), str),
     "height": {"source": str, "fixed_m": float},
     "altimeter": {"file": str, "datum": str, "ground_m": float},
     "reference": {"file": str, "crs": str},
@@ -267,7 +269,8 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
         folder / "masks", masks, table, camera, optional=False
     )
 
-    odometry = _odometry(toml, folder, mount, frames, times) if with_odometry else None
+    simulated = bool(toml.data.get("simulated", "\n".join(toml.lines).startswith(_OLD_NOTE)))
+    odometry = _odometry(toml, folder, mount, frames, times, simulated) if with_odometry else None
     reference = _reference(toml, folder)
     return Flight(
         folder,
@@ -278,7 +281,7 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
         odometry,
         has_masks,
         has_images,
-        simulated=bool(toml.data.get("simulated", "\n".join(toml.lines).startswith(_OLD_NOTE))),
+        simulated=simulated,
         _video=video,
         _video_start_s=toml.number("frames", "start_s", 0.0),
         _reference=reference,
@@ -577,7 +580,12 @@ def _check_files(folder: Path, names: Sequence[str], table: Table, camera: Camer
 
 
 def _odometry(
-    toml: _FlightToml, folder: Path, mount: Attitude, frames: tuple[Frame, ...], times: FloatArray
+    toml: _FlightToml,
+    folder: Path,
+    mount: Attitude,
+    frames: tuple[Frame, ...],
+    times: FloatArray,
+    simulated: bool,
 ) -> Odometry | None:
     if "odometry" not in toml.data:
         stray = sorted(folder.glob("odometry.*"))
@@ -596,6 +604,10 @@ def _odometry(
     if order not in (None, "xyzw", "wxyz"):
         raise toml.refuse("odometry", "quaternion", f"quaternion is {order!r}: it must be 'xyzw' or 'wxyz'")
     topic = toml.text("odometry", "topic") if toml.has("odometry", "topic") else None
+    axes = toml.section("odometry").get("axes")
+    if axes is not None and (axes not in get_args(Axes) or format_name not in AXES_UNTOLD):
+        known = listed(get_args(Axes)) if format_name in AXES_UNTOLD else "left out: the format has its own"
+        raise toml.refuse("odometry", "axes", f"axes is {axes!r}: for {format_name} it must be {known}")
     body = mount.body_from_camera()
     told = None
     if toml.has("odometry", "times"):
@@ -606,7 +618,9 @@ def _odometry(
         told = read_times(folder / toml.text("odometry", "times"))
     first = frames[0 if told is None else int(np.abs(times - told[0]).argmin())]
     level = Attitude(first.roll_rad, first.pitch_rad).matrix() @ body
-    options = OdometryOptions(order, times if told is None else told, level, body, topic, told is not None)
+    options = OdometryOptions(
+        order, times if told is None else told, level, body, topic, told is not None, axes
+    )
     odometry = read_odometry(path, format_name, options)
     if toml.has("odometry", "covariance"):
         odometry = _covariance(folder / toml.text("odometry", "covariance"), odometry)
@@ -618,6 +632,10 @@ def _odometry(
             f"{path}: the orientations tilt the body by {tilt:.0f} degrees (median), so they are not those of an upright "
             "body (x nose, y left, z up) in a frame with z up: check quaternion (xyzw or wxyz) in [odometry], or turn them"
         )
+    if axes is None and format_name in AXES_UNTOLD and not simulated:
+        says = doubtful_axes(odometry)
+        if says:
+            raise FlightError(f"{path}: {says} (in [odometry] of flight.toml)")
     return odometry
 
 

@@ -13,9 +13,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from brmgeo.flight.readings import FloatArray
+from brmgeo.flight.readings import BODY_FROM_NADIR_CAMERA, FloatArray
 
 QuaternionOrder = Literal["xyzw", "wxyz"]
+#: What the axes of a track's world and body may be: ``flu`` (x nose, y left, z up), ``frd`` (x nose, y right, z down),
+#: ``optical`` of a camera that looks ahead (x right, y down, z ahead), ``nadir`` of one that looks down (x right, y back,
+#: z down; the picture's top is the nose).
+Axes = Literal["flu", "frd", "optical", "nadir"]
 
 #: (w, x, y, z) of the half turn about x that takes FRD to FLU (and back), and of the one that takes NED to ENU.
 FLU_FROM_FRD: FloatArray = np.array([0.0, 1.0, 0.0, 0.0])
@@ -98,15 +102,19 @@ def flu_flu_from_frd_frd(wxyz: FloatArray) -> FloatArray:
     return multiply(multiply(FLU_FROM_FRD, wxyz), FLU_FROM_FRD)
 
 
-def flu_from_optical(vectors: FloatArray) -> FloatArray:
-    """(..., 3) x ahead, y left, z up of (..., 3) x right, y down, z ahead: a track told in a level camera's axes."""
-    return np.asarray(vectors, dtype=np.float64)[..., [2, 0, 1]] * [1.0, -1.0, -1.0]
+def to_flu(axes: Axes, xyz: FloatArray, wxyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(..., 3) places and (..., 4) attitudes in FLU of those whose world and body are both told in other ``axes``."""
+    turn = _TO_FLU[axes]
+    return rotate(turn, xyz), multiply(multiply(turn, wxyz), inverse(turn))
 
 
-def flu_flu_from_optical(wxyz: FloatArray) -> FloatArray:
-    """(..., 4) attitude of one whose world and body are both told in the axes of a level camera that looks ahead."""
-    turn = np.array([0.5, -0.5, 0.5, -0.5])
-    return multiply(multiply(turn, wxyz), inverse(turn))
+#: flu_from_axes.
+_TO_FLU: dict[str, FloatArray] = {
+    "flu": np.array([1.0, 0.0, 0.0, 0.0]),
+    "frd": FLU_FROM_FRD,
+    "optical": np.array([0.5, -0.5, 0.5, -0.5]),
+    "nadir": quaternion_from_matrix(BODY_FROM_NADIR_CAMERA),
+}
 
 
 def heading_deg(wxyz: FloatArray) -> FloatArray:

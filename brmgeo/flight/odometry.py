@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.flight.frames import inverse, multiply, quaternion_from_matrix, rotate, to_flu
 from brmgeo.flight.poses import TEXT_READERS, OdometryOptions, PoseReader
 from brmgeo.flight.readings import Odometry
 from brmgeo.settings import nearest
@@ -54,4 +56,16 @@ def read_odometry(path: Path, format_name: str, options: OdometryOptions | None 
         raise FlightError(
             f"{path}: odometry format {format_name!r} is unknown: {nearest(format_name, list(READERS))}"
         )
-    return READERS[format_name](path, options or OdometryOptions())
+    options = options or OdometryOptions()
+    odometry = READERS[format_name](path, options)
+    if options.axes in (None, "flu"):
+        return odometry
+    if options.axes == "nadir":
+        # The first camera is the world; its tilt makes it level.
+        level, body = (
+            quaternion_from_matrix(m) for m in (options.level_from_camera, options.body_from_camera)
+        )
+        xyz, wxyz = rotate(level, odometry.xyz_m), multiply(multiply(level, odometry.wxyz), inverse(body))
+    else:
+        xyz, wxyz = to_flu(options.axes, odometry.xyz_m, odometry.wxyz)
+    return replace(odometry, xyz_m=xyz, wxyz=wxyz)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brmgeo.flight.frames import QuaternionOrder, likely_order, quaternion_from_matrix
+from brmgeo.flight.frames import Axes, QuaternionOrder, likely_order, quaternion_from_matrix
 from brmgeo.flight.readings import BODY_FROM_NADIR_CAMERA, FloatArray, Odometry
 from brmgeo.flight.tables import check_increasing, number, read_rows, read_table, read_text, refuse
 
@@ -35,6 +35,7 @@ class OdometryOptions:
         body_from_camera: (3, 3) the camera's mount, for the same.
         topic: which of several, for logs that hold more than one odometry.
         own_times: ``frame_times_s`` are from a file of the poses' own.
+        axes: those of the track's world and body, where they are not ours; ``nadir`` takes the two rotations above.
     """
 
     quaternion: QuaternionOrder | None = None
@@ -43,6 +44,7 @@ class OdometryOptions:
     body_from_camera: FloatArray = field(default_factory=lambda: BODY_FROM_NADIR_CAMERA)
     topic: str | None = None
     own_times: bool = False
+    axes: Axes | None = None
 
 
 PoseReader = Callable[[Path, OdometryOptions], Odometry]
@@ -199,7 +201,7 @@ def _read_kitti(path: Path, options: OdometryOptions) -> Odometry:
 
 #: The text formats, as written in flight.toml, and their readers.
 TEXT_READERS: dict[str, PoseReader] = {
-    "tum": _text_reader(None, range(8, 9), False, "xyzw"),
+    "tum": _text_reader(None, range(8, 9), None, "xyzw"),
     "euroc": _text_reader(",", range(8, 30), True, "wxyz"),
     "kitti": _read_kitti,
     "vins-mono": _text_reader(",", range(8, 12), None, "wxyz", dialects=True),

@@ -167,8 +167,13 @@ def read_times(path: Path) -> FloatArray:
     return times
 
 
+def is_header(row: Sequence[str]) -> bool:
+    """True for eight cells and more that all begin with a letter: names of columns."""
+    return len(row) >= 8 and all(cell.strip()[:1].isalpha() for cell in row)
+
+
 def read_rows(path: Path, separator: str | None, widths: range) -> tuple[list[list[str]], list[int]]:
-    """Cells and line numbers of a table without a header; '#' lines and blank lines are left out.
+    """Cells and line numbers of a table of numbers; '#' lines, blank lines and a first row of names alone are left out.
 
     Args:
         separator: ',' (one trailing comma is let pass) or None for white space.
@@ -181,6 +186,8 @@ def read_rows(path: Path, separator: str | None, widths: range) -> tuple[list[li
         if not line or line.startswith("#"):
             continue
         row = line.removesuffix(",").split(",") if separator else line.split()
+        if not cells and is_header(row):
+            continue
         expected = range(len(cells[0]), len(cells[0]) + 1) if cells else widths
         if len(row) not in expected:
             wanted = str(expected[0]) if len(expected) == 1 else f"{expected[0]} to {expected[-1]}"

@@ -8,7 +8,17 @@ from log_writers import ACCEL, GYRO, WXYZ, XYZ, T
 from scipy.spatial.transform import Rotation
 
 from brmgeo.flight import checks
-from brmgeo.flight.readings import Imu, Odometry
+from brmgeo.flight.frames import to_flu
+from brmgeo.flight.readings import BODY_FROM_NADIR_CAMERA, Imu, Odometry
+from brmgeo.synth.flight import (
+    OdometryErrors,
+    SimulationSettings,
+    fly,
+    lawnmower,
+    odometry_of,
+    random_mission,
+    rectangle,
+)
 
 TRACK = Odometry(T, XYZ, WXYZ)
 
@@ -71,3 +81,80 @@ def test_the_axis_of_height_and_tilt() -> None:
     assert checks.flat_axis(XYZ * 0) is None
     assert checks.median_tilt_deg(WXYZ) < 10.0
     assert checks.median_tilt_deg(WXYZ[:, [1, 0, 3, 2]]) > 150.0  # turned by half a turn about x
+
+
+def flown(path: np.ndarray, seed: int, **settings: float) -> Odometry:
+    """VIO of a simulated flight: body x nose, y left, z up."""
+    course = fly(path, SimulationSettings(**settings), seed)  # type: ignore[arg-type]
+    return odometry_of(course, OdometryErrors(), seed)
+
+
+def told_in(axes: str, track: Odometry) -> Odometry:
+    """The same flight as one told in other axes has it, whose own first pose is the world."""
+    turn = {"flu": np.eye(3), "frd": np.diag([1.0, -1.0, -1.0]), "nadir": BODY_FROM_NADIR_CAMERA.T}[axes]
+    poses = Rotation.from_matrix(turn) * Rotation.from_quat(track.wxyz[:, [1, 2, 3, 0]])
+    poses = poses * Rotation.from_matrix(turn).inv()
+    xyz = track.xyz_m @ turn.T
+    return Odometry(track.t_s, xyz - xyz[0], poses.as_quat()[:, [3, 0, 1, 2]])
+
+
+TURNING = {
+    "rectangle": rectangle((0.0, 0.0), 0.4),
+    "mission": random_mission((0.0, 0.0, 2000.0, 2000.0), 3),
+    "lawnmower": lawnmower((0.0, 0.0, 400.0, 300.0), 75.0),
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("path", TURNING)
+def test_a_track_whose_z_axis_points_down_is_told_by_its_leaning(path: str, seed: int) -> None:
+    track = flown(TURNING[path], seed)
+    lean = checks.leaning(track)
+    assert lean is not None
+    assert lean > 0.4
+    assert checks.doubtful_axes(track) == checks.doubtful_axes(told_in("flu", track)) == ""
+    for axes, words in (
+        ("nadir", "give axes nadir (a camera that looks down);"),
+        ("frd", "give axes frd, or nadir"),
+    ):
+        other = told_in(axes, track)
+        down = checks.leaning(other)
+        assert down is not None
+        assert down < -0.4
+        assert words in checks.doubtful_axes(other)
+        # Turned as it says, nothing is left to say, and the flight is the same again.
+        xyz, wxyz = to_flu(axes, other.xyz_m, other.wxyz)  # type: ignore[arg-type]
+        assert checks.doubtful_axes(Odometry(track.t_s, xyz, wxyz)) == ""
+        assert xyz == pytest.approx(track.xyz_m - track.xyz_m[0], abs=1e-6)
+        # A scale that is unknown changes nothing.
+        assert checks.doubtful_axes(Odometry(other.t_s, other.xyz_m * 0.037, other.wxyz)) != ""
+
+
+def test_a_straight_or_stabilised_track_is_asked_for_where_it_may_be_a_cameras() -> None:
+    straight = flown(np.array([[0.0, 0.0], [900.0, 120.0]]), 2)
+    assert checks.leaning(straight) is None
+    assert checks.doubtful_axes(straight) == ""
+    assert "it flies along its y axis" in checks.doubtful_axes(told_in("nadir", straight))
+    # A gimbal keeps the camera level: only the way tells.
+    level = flown(TURNING["lawnmower"], 1, wobble_deg=0.0, cruise_pitch_deg=0.0)
+    yaw = Rotation.from_quat(level.wxyz[:, [1, 2, 3, 0]]).as_euler("ZYX")[:, 0]
+    held = Rotation.from_euler("Z", yaw[:, None]).as_quat()[:, [3, 0, 1, 2]]
+    level = Odometry(level.t_s, level.xyz_m, held)
+    assert checks.leaning(level) is None
+    assert checks.doubtful_axes(level) == ""
+    assert "give axes nadir, or flu" in checks.doubtful_axes(told_in("nadir", level))
+    # Flown with its nose to the north: the way says nothing either, but that the first pose is the world.
+    north = Odometry(
+        level.t_s, level.xyz_m - level.xyz_m[0], np.tile([1.0, 0.0, 0.0, 0.0], (len(level.t_s), 1))
+    )
+    assert "it begins as its own world" in checks.doubtful_axes(north)
+
+
+def test_a_mirrored_track_is_told_by_a_reference() -> None:
+    track = flown(TURNING["mission"], 5).xyz_m[:, :2]
+    turn = Rotation.from_euler("Z", 0.8).as_matrix()[:2, :2]
+    true = track @ turn.T * 1.1 + [300.0, -20.0]
+    as_it_is, mirrored = checks.mirrored_m(track, true)
+    assert as_it_is == pytest.approx(0.0, abs=1e-6)
+    assert mirrored > 50.0
+    assert checks.mirrored_m(track * [1.0, -1.0], true) == pytest.approx((mirrored, as_it_is), abs=1e-6)

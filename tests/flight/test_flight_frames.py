@@ -13,6 +13,7 @@ from brmgeo.flight.readings import Attitude
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
+FLU_FROM_NADIR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 angles = st.floats(-3.1, 3.1)
 turns = st.builds(lambda y, p, r: Rotation.from_euler("ZYX", [y, p, r]), angles, st.floats(-1.5, 1.5), angles)
@@ -40,11 +41,14 @@ def test_an_attitude_turns_with_its_frames(turn: Rotation, v: np.ndarray) -> Non
     assert np.allclose(
         frames.rotate(q, frames.flu_from_frd(v)), frames.flu_from_frd(turn.apply(v)), atol=1e-8
     )
-    q = frames.flu_flu_from_optical(wxyz(turn))
-    assert np.allclose(
-        frames.rotate(q, frames.flu_from_optical(v)), frames.flu_from_optical(turn.apply(v)), atol=1e-8
-    )
-    assert np.allclose(frames.flu_from_optical(v), FLU_FROM_OPTICAL @ v)
+    for axes, flu_from_axes in (
+        ("optical", FLU_FROM_OPTICAL),
+        ("nadir", FLU_FROM_NADIR),
+        ("frd", FLU_FROM_FRD),
+    ):
+        there, q = frames.to_flu(axes, turn.apply(v), wxyz(turn))
+        assert np.allclose(there, flu_from_axes @ turn.apply(v), atol=1e-8)
+        assert np.allclose(frames.rotate(q, flu_from_axes @ v), there, atol=1e-8)
     assert np.allclose(frames.enu_from_ned(frames.enu_from_ned(v)), v)
 
 

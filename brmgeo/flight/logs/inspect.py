@@ -123,6 +123,8 @@ def _track_lines(track: Odometry, log: Log) -> list[str]:
             )
         elif checks.median_tilt_deg(track.wxyz) > MAX_MEDIAN_TILT_DEG:
             lines.append(f"             {axes_fault(track).says}")
+    elif log.kind in checks.AXES_UNTOLD and (says := checks.doubtful_axes(track)):
+        lines.append(f"             {says}")
     if log.gnss is not None and log.odometry is track:
         fit = _against_gnss(log, track)
         if fit is not None:

@@ -30,12 +30,9 @@ def normal(path: Path, log: Log, settings: ImportSettings | None = None) -> Log:
     """The log with axes and units as told, held against itself; FlightError where clocks, units or axes cannot be right."""
     settings = settings or ImportSettings()
     odometry = log.odometry
-    if odometry is not None and settings.axes == "optical":
-        odometry = replace(
-            odometry,
-            xyz_m=frames.flu_from_optical(odometry.xyz_m),
-            wxyz=frames.flu_flu_from_optical(odometry.wxyz),
-        )
+    if odometry is not None and settings.axes not in (None, "flu"):
+        xyz, wxyz = frames.to_flu(settings.axes, odometry.xyz_m, odometry.wxyz)
+        odometry = replace(odometry, xyz_m=xyz, wxyz=wxyz)
     body = frames.quaternion_from_euler(*np.radians(settings.body_deg))
     if odometry is not None and any(settings.body_deg):
         odometry = replace(odometry, wxyz=frames.multiply(odometry.wxyz, frames.inverse(body)))
@@ -59,6 +56,10 @@ def normal(path: Path, log: Log, settings: ImportSettings | None = None) -> Log:
     ):
         fault = axes_fault(odometry)
         raise FlightError(f"{path}: {fault.says}", needs=fault.needs)
+    if odometry is not None and settings.axes is None and log.kind in checks.AXES_UNTOLD:
+        says = checks.doubtful_axes(odometry)
+        if says:
+            raise FlightError(f"{path}: {odometry.source}: {says}", needs="axes")
     return log
 
 

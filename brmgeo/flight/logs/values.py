@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import FlightError
-from brmgeo.flight.frames import QuaternionOrder
+from brmgeo.flight.frames import Axes, QuaternionOrder
 from brmgeo.flight.readings import Camera, FloatArray, Imu, Odometry
 from brmgeo.pictures import SUFFIXES
 
@@ -52,7 +52,8 @@ class ImportSettings:
 
     ``photos`` and ``video`` stand in for pictures that the log does not hold; ``video_start_s`` is the log's time at
     which the video begins. ``camera`` is fx, fy, cx, cy[, k1, k2, p1, p2, k3]. ``body_deg`` and ``mount_deg`` are roll,
-    pitch, yaw: of the log's body in ours, and of the camera in the body. ``axes`` is ``flu`` or ``optical``.
+    pitch, yaw: of the log's body in ours, and of the camera in the body. ``axes`` is one of ``frames.Axes``, or None
+    where it is to be found out that they are ours.
     ``imu_units`` are units that the log is known to be in, such as ("deg/s", "g"). ``shift_frames_s`` is added to the
     frames' times.
     """
@@ -68,7 +69,7 @@ class ImportSettings:
     ground_m: float | None = None
     mount_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     body_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
-    axes: str = "flu"
+    axes: Axes | None = None
     imu_units: tuple[str, ...] = ()
     rate_hz: float | None = None
     shift_frames_s: float = 0.0
