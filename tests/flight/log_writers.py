@@ -243,7 +243,7 @@ def ulog(
     messages: dict[str, tuple[str, list[tuple[Any, ...]]]],
     dropout_ms: int | None = None,
 ) -> Path:
-    """``messages``: name -> (fields "uint64_t timestamp;float x;...", rows of values)."""
+    """``messages``: name -> (fields "uint64_t timestamp;float x;...", rows of values); "name#1" is a second instance."""
     codes = {
         "uint64_t": "Q",
         "float": "f",
@@ -262,8 +262,16 @@ def ulog(
     key = f"char[{len(info)}] sys_name".encode()
     out.append(block("B", bytes(40)))
     out.append(block("I", bytes([len(key)]) + key + info))
-    out += [block("F", f"{name}:{fields}".encode()) for name, (fields, _) in messages.items()]
-    out += [block("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(messages)]
+    named = [name.partition("#")[::2] for name in messages]
+    out += [
+        block("F", f"{name}:{fields}".encode())
+        for (name, again), (fields, _) in zip(named, messages.values())
+        if not again
+    ]
+    out += [
+        block("A", struct.pack("<BH", int(again or 0), i) + name.encode())
+        for i, (name, again) in enumerate(named)
+    ]
     rows = []
     for i, (fields, values) in enumerate(messages.values()):
         code = "<"
@@ -284,8 +292,11 @@ def ulog(
 US = np.round(T * 1e6).astype(np.int64)
 
 
-def px4(path: Path, *, version: str = "local", **options: Any) -> Path:
-    """A PX4 log: ``local`` (position + attitude), ``old`` or ``new`` vehicle_odometry, ``vision`` in an FRD frame."""
+def px4(path: Path, *, version: str = "local", ahead: bool = False, **options: Any) -> Path:
+    """A PX4 log: ``local`` (position + attitude), ``old`` or ``new`` vehicle_odometry, ``vision`` in an FRD frame.
+
+    ``ahead``: the first rangefinder looks forward, the second one down.
+    """
     messages: dict[str, tuple[str, list[tuple[Any, ...]]]] = {
         "vehicle_attitude": (
             "uint64_t timestamp;float[4] q;",
@@ -301,6 +312,10 @@ def px4(path: Path, *, version: str = "local", **options: Any) -> Path:
         ),
         "camera_trigger": ("uint64_t timestamp;uint32_t seq;", [(int(u), k) for k, u in enumerate(US[::60])]),
     }
+    if ahead:
+        fields, rows = messages["distance_sensor"]
+        messages["distance_sensor"] = fields, [(*row[:3], 12.0, 0) for row in rows]
+        messages["distance_sensor#1"] = fields, rows
     if version == "local":
         messages["vehicle_local_position"] = (
             "uint64_t timestamp;float x;float y;float z;bool xy_valid;uint8_t xy_reset_counter;",
@@ -351,10 +366,19 @@ def px4(path: Path, *, version: str = "local", **options: Any) -> Path:
 # ---------------------------------------------------------------- ArduPilot dataflash and telemetry
 
 
-def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True, vision: float | None = None) -> Path:
+def dataflash(
+    path: Path,
+    *,
+    era: str = "TimeUS",
+    position: bool = True,
+    vision: float | None = None,
+    switch: int | None = None,
+) -> Path:
     """An ArduPilot .bin: FMT records, then rows in order of time. ``era`` is TimeUS or TimeMS (before 2015).
 
     ``vision`` times the positions are told as those of a camera, too (NaN: by one that saw nothing).
+    ``switch``: from this row on the second core is the primary one, and the first tells nothing of use; the first
+    rangefinder then looks forward, the second one down.
     """
     us = era == "TimeUS"
     clock = "Q" if us else "I"
@@ -367,6 +391,9 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True, vision:
         "CAM": (134, clock + "H", f"{era},Img"),
         "GPS": (135, *(("QBIHLLf", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt") if us else ("BILLfI", old))),
     }  # fmt: skip
+    if switch is not None:
+        formats["XKF4"] = (137, "QBB", "TimeUS,C,PI")
+        formats["RFND"] = (133, "QBfB", "TimeUS,Instance,Dist,Orient")
     if vision is not None:
         formats["VISP"] = (136, clock + "ffffffB", f"{era},PX,PY,PZ,Roll,Pitch,Yaw,Rst")
     if position:
@@ -398,19 +425,26 @@ def dataflash(path: Path, *, era: str = "TimeUS", position: bool = True, vision:
         row("ATT", t, r, p, y % 360.0)
         if vision is not None:
             row("VISP", t, *(float(v) * vision for v in NED[i]), r, p, y % 360.0, int(i >= 200))
+        if switch is not None:
+            row("XKF4", t, 0, int(i >= switch))
+            row("XKF4", t, 1, int(i >= switch))
         if position:
             row(
                 name,
                 t,
-                *([0] if us else []),
+                *([int(switch is not None and i >= switch)] if us else []),
                 r,
                 p,
                 y % 360.0,
                 *(map(float, NED[i]) if i > 3 else (0.0, 0.0, 0.0)),
             )
             if us:
-                row(name, t, 1, r, p, y, 9e3, 9e3, 9e3)  # the second core is not ours
-        if i % 2 == 0:
+                # the other core is not ours
+                row(name, t, int(switch is None or i < switch), r, p, y, 9e3, 9e3, 9e3)
+        if switch is not None:
+            row("RFND", t, 0, 12.0, 0)
+            row("RFND", t, 1, float(XYZ[i, 2]), 25)
+        elif i % 2 == 0:
             row("RFND", t, float(XYZ[i, 2]))
         if i % 4 == 0:
             place = round(LAT[i] * 1e7), round(LON[i] * 1e7), float(XYZ[i, 2])

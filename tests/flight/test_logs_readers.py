@@ -32,7 +32,7 @@ from log_writers import (
 
 from brmgeo.errors import FlightError, InputError, MissingExtraError, MissingInputError
 from brmgeo.flight.logs import Log, LogOptions, kind_of, read_log
-from brmgeo.flight.logs.values import in_order
+from brmgeo.flight.logs.values import in_order, looking_down
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 
 pytest.importorskip("rosbags")
@@ -401,3 +401,36 @@ def test_no_longer_chain_of_times_is_there(times: list[int]) -> None:
     for i, t in enumerate(times):
         longest[i] = 1 + max((longest[k] for k in range(i) if times[k] < t), default=0)
     assert kept.sum() == max(longest, default=0)
+
+
+@pytest.mark.parametrize("make", ["px4", "dataflash"])
+def test_a_rangefinder_that_looks_forward_is_no_height(tmp_path: Path, make: str) -> None:
+    log = read_log(
+        px4(tmp_path / "log.ulg", ahead=True)
+        if make == "px4"
+        else dataflash(tmp_path / "log.bin", switch=200)
+    )
+    assert log.height is not None
+    assert log.height.above == "ground"
+    assert np.allclose(log.height.agl_m, np.interp(log.height.t_s, T, XYZ[:, 2]), atol=0.05)
+    assert any("not taken as height: it looks forward (orientation 0)" in note for note in log.notes)
+
+
+def test_one_rangefinder_of_several_is_taken_by_what_it_tells() -> None:
+    notes: list[str] = []
+    assert looking_down(notes, {"a": None, "b": None}) is None
+    assert looking_down(notes, {"a": 0}) is None
+    assert len(notes) == 3
+    assert looking_down(notes, {"a": None}) == "a"
+    assert "no orientation is told" in notes[-1]
+    assert looking_down(notes, {"a": 24, "b": 25, "c": 25}) == "b"
+    assert [n.split(" ")[0] for n in notes[-2:]] == ["a", "c"]
+
+
+def test_the_track_is_that_of_the_primary_core_and_begins_anew_at_a_switch(tmp_path: Path) -> None:
+    log = read_log(dataflash(tmp_path / "log.bin", switch=200))
+    check_track(log, xyz_m=1e-2, skip=4)
+    assert log.odometry is not None
+    assert log.odometry.segment is not None
+    assert np.flatnonzero(np.diff(log.odometry.segment)).tolist() == [195]
+    assert any("primary core changes 1 times, first from 0 to 1" in note for note in log.notes)

@@ -17,12 +17,14 @@ from brmgeo.files import scratch_folder
 from brmgeo.flight.frames import enu_flu_from_ned_frd, enu_from_ned, flu_from_frd, quaternion_from_euler
 from brmgeo.flight.logs.mavlink import Clock, Messages, library, opened, read_telemetry, rows_of
 from brmgeo.flight.logs.values import (
+    DOWN,
     Gnss,
     Height,
     Log,
     LogOptions,
     Orientation,
     choose,
+    looking_down,
     mixed,
     tell_lost,
     tell_unread,
@@ -40,6 +42,9 @@ _DATAFLASH = (
     "AHR2",
     "VISP",
     "IMU",
+    "XKF4",
+    "NKF4",
+    "PARM",
     "RFND",
     "CTUN",
     "GPS",
@@ -164,8 +169,8 @@ def _odometry(
     notes: list[str],
 ) -> tuple[tuple[str, ...], Odometry | None]:
     # The names of every track that is there, and the chosen one.
-    streams = {name: _core(found[name], notes) for name in _FILTERS if name in found}
-    counts = {name: len(rows) for name, rows in streams.items() if rows}
+    streams = {name: _core(name, found, time, notes) for name in _FILTERS if name in found}
+    counts = {name: len(messages) for name, (messages, _) in streams.items() if messages}
     seen = rows_of(
         found.get("VISP", []),
         lambda m: [time(m), m.PX, m.PY, m.PZ, m.Roll, m.Pitch, m.Yaw, getattr(m, "Rst", 0)],
@@ -180,7 +185,13 @@ def _odometry(
         segment = seen[:, 7].astype(np.int64)
         xyz = enu_from_ned(seen[:, 1:4])
         return tuple(counts), Odometry(seen[:, 0], xyz, _from_degrees(seen[:, 4:7]), "VISP", segment)
-    rows = rows_of(streams[stream], lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw], notes)
+    messages, parts = streams[stream]
+    segment_of = {id(m): part for m, part in zip(messages, parts)}
+    rows = rows_of(
+        messages,
+        lambda m: [time(m), m.PN, m.PE, m.PD, m.Roll, m.Pitch, m.Yaw, segment_of[id(m)]],
+        notes,
+    )
     # The filter says zero until it has an origin.
     begun = np.flatnonzero(rows[:, 1:4].any(axis=1)) if rows.size else np.empty(0, np.int64)
     if not begun.size:
@@ -191,7 +202,8 @@ def _odometry(
     if attitude is not None and stream == "EKF1":
         # EKF1 tells angles late in some versions.
         wxyz = mixed(attitude.t_s, attitude.wxyz, rows[:, 0])
-    return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream)
+    segment = rows[:, 7].astype(np.int64) if rows[-1, 7] > rows[0, 7] else None
+    return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream, segment)
 
 
 def _imu(found: Messages, time: Clock, notes: list[str]) -> Imu | None:
@@ -213,15 +225,33 @@ def _boot_seconds(found: Messages) -> Clock:
     return seconds
 
 
-def _core(messages: list[Any], notes: list[str]) -> list[Any]:
-    # One estimator of those that run side by side: the first core.
+def _core(name: str, found: Messages, time: Clock, notes: list[str]) -> tuple[list[Any], list[int]]:
+    # One estimator of those that run side by side: the primary core of each time, or the first where none is told; and the
+    # segment of each message, which grows where the primary changes.
+    messages = found[name]
     key = next((k for k in ("C", "I") if hasattr(messages[0], k)), None)
     if key is None:
-        return messages
-    first = min(getattr(m, key) for m in messages)
-    own = [m for m in messages if getattr(m, key) == first]
-    tell_lost(notes, messages[0].get_type(), len(own), len(messages), f"of other cores than {first}")
-    return own
+        return messages, [0] * len(messages)
+    told = rows_of(
+        [m for m in found.get(f"{name[:-1]}4", []) if getattr(m, key, 0) == 0 and hasattr(m, "PI")],
+        lambda m: [time(m), m.PI],
+        notes,
+    )
+    if not told.size:
+        told = np.array([[0.0, min(getattr(m, key) for m in messages)]])
+    switches = np.flatnonzero(np.diff(told[:, 1])) + 1
+    since = np.append(0, switches)
+    starts, cores = told[switches, 0], told[since, 1].astype(np.int64)
+    part = np.searchsorted(starts, [time(m) for m in messages], side="right")
+    kept = [i for i, m in enumerate(messages) if getattr(m, key) == cores[part[i]]]
+    names = str(cores[0]) if not switches.size else "the primary one"
+    tell_lost(notes, name, len(kept), len(messages), f"of other cores than {names}")
+    if switches.size:
+        notes.append(
+            f"{name}: the primary core changes {switches.size} times, first from {cores[0]} to {cores[1]} at "
+            f"{starts[0]:.3f} s: the track begins anew there"
+        )
+    return [messages[i] for i in kept], [int(part[i]) for i in kept]
 
 
 def _from_degrees(angles: FloatArray) -> FloatArray:
@@ -243,12 +273,35 @@ def _gnss(found: Messages, time: Clock, notes: list[str]) -> Gnss | None:
 
 
 def _height(found: Messages, time: Clock, odometry: Odometry | None, notes: list[str]) -> Height | None:
-    ranges = [
-        m for m in found.get("RFND", []) if getattr(m, "Orient", 25) == 25 and getattr(m, "Stat", 4) == 4
-    ]
-    rows = rows_of(ranges, lambda m: [time(m), m.Dist if hasattr(m, "Dist") else m.Dist1], notes)
-    if rows.size and (rows[:, 1] > 0.0).any():
-        return Height(rows[:, 0], rows[:, 1], "ground", "RFND")
+    sensors = _rangefinders(found)
+    name = looking_down(notes, {n: way for n, (way, _, _) in sensors.items()})
+    if name is not None:
+        _, field, messages = sensors[name]
+        ranges = [m for m in messages if getattr(m, "Orient", DOWN) == DOWN and getattr(m, "Stat", 4) == 4]
+        rows = rows_of(ranges, lambda m: [time(m), getattr(m, field)], notes)
+        if rows.size and (rows[:, 1] > 0.0).any():
+            return Height(rows[:, 0], rows[:, 1], "ground", name)
     if odometry is not None:
         return Height(odometry.t_s, odometry.xyz_m[:, 2], "take-off", odometry.source)
     return None
+
+
+def _rangefinders(found: Messages) -> dict[str, tuple[int | None, str, list[Any]]]:
+    # Name -> orientation, the field of its distance, its messages. Logs before 4.0 tell two in one message, and their
+    # orientations among the parameters alone.
+    sets = {str(m.Name): float(m.Value) for m in found.get("PARM", []) if hasattr(m, "Value")}
+    each: dict[int, list[Any]] = {}
+    for m in found.get("RFND", []):
+        each.setdefault(int(getattr(m, "Instance", 0)), []).append(m)
+    out: dict[str, tuple[int | None, str, list[Any]]] = {}
+    for number, messages in sorted(each.items()):
+        ways = [int(m.Orient) for m in messages if hasattr(m, "Orient")]
+        for field in ("Dist", "Dist1", "Dist2"):
+            if not any(getattr(m, field, 0.0) > 0.0 for m in messages):
+                continue
+            nth = number + 1 if field == "Dist" else int(field[-1])
+            told = [sets[n] for n in (f"RNGFND{nth}_ORIENT", "RNGFND_ORIENT")[: 1 + (nth == 1)] if n in sets]
+            way = (DOWN if DOWN in ways else ways[0]) if ways else int(told[0]) if told else None
+            alone = len(each) == 1 and field != "Dist2"
+            out["RFND" if alone else f"RFND {nth}"] = (way, field, messages)
+    return out

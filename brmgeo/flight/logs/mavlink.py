@@ -26,6 +26,7 @@ from brmgeo.flight.logs.values import (
     Orientation,
     choose,
     in_order,
+    looking_down,
     mixed,
     tell_lost,
 )
@@ -254,13 +255,15 @@ def _imu(found: Messages, time: Clock, notes: list[str]) -> Imu | None:
 
 
 def _height(found: Messages, time: Clock, odometry: Odometry | None, notes: list[str]) -> Height | None:
-    down = rows_of(
-        [m for m in found.get("DISTANCE_SENSOR", []) if m.orientation == 25],
-        lambda m: [time(m), m.current_distance / 100.0],
-        notes,
-    )
-    if down.size:
-        return Height(down[:, 0], down[:, 1], "ground", "DISTANCE_SENSOR")
+    sensors: Messages = {}
+    for m in found.get("DISTANCE_SENSOR", []):
+        sensors.setdefault(f"DISTANCE_SENSOR {m.id}, orientation {m.orientation}", []).append(m)
+    name = looking_down(notes, {n: int(messages[0].orientation) for n, messages in sensors.items()})
+    if name is not None:
+        down = rows_of(sensors[name], lambda m: [time(m), m.current_distance / 100.0], notes)
+        if down.size:
+            source = "DISTANCE_SENSOR" if len(sensors) == 1 else name
+            return Height(down[:, 0], down[:, 1], "ground", source)
     ranges = rows_of(found.get("RANGEFINDER", []), lambda m: [time(m), m.distance], notes)
     if ranges.size and (ranges[:, 1] > 0.0).any():
         return Height(ranges[:, 0], ranges[:, 1], "ground", "RANGEFINDER")

@@ -23,6 +23,7 @@ from brmgeo.flight.frames import (
     flu_from_frd,
 )
 from brmgeo.flight.logs.values import (
+    DOWN,
     Gnss,
     Height,
     Log,
@@ -31,6 +32,7 @@ from brmgeo.flight.logs.values import (
     are_turns,
     choose,
     in_order,
+    looking_down,
     mixed,
     tell_lost,
     tell_unread,
@@ -43,7 +45,6 @@ Data = dict[str, Any]
 _STREAMS = ("vehicle_visual_odometry", "vehicle_odometry", "vehicle_local_position")
 _TYPES = b"BFIMPQALDCSOR"
 _DATA = _TYPES[8]
-_DOWN = 25  # ROTATION_PITCH_270 of distance_sensor.orientation
 
 
 def read_ulog(path: Path, options: LogOptions | None = None) -> Log:
@@ -116,6 +117,8 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
             f"{stream} is the autopilot's own estimate"
             + (", which GNSS goes into: it is no odometry of a flight without GNSS" if used_gnss else "")
         )
+    if "estimator_selector_status" in sets and stream in ("vehicle_odometry", "vehicle_local_position"):
+        _tell_switches(sets["estimator_selector_status"], notes)
     triggers = next((sets[n]["timestamp"] for n in ("camera_capture", "camera_trigger") if n in sets), None)
     return Log(
         kind="ulog",
@@ -125,7 +128,7 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
         uses_gnss=None if stream is None or stream == "vehicle_visual_odometry" else used_gnss,
         candidates=tuple(found),
         imu=_imu(sets, notes),
-        height=_height(sets, odometry, notes),
+        height=_height(log, sets, odometry, notes),
         attitude=attitude,
         gnss=gnss,
         triggers_s=None if triggers is None else _s(triggers),
@@ -134,6 +137,17 @@ def _normal(path: Path, log: Any, sets: dict[str, Data], notes: list[str], optio
         notes=tuple(notes),
         faults=tuple(faults),
     )
+
+
+def _tell_switches(data: Data, notes: list[str]) -> None:
+    # The autopilot's estimate is that of the primary filter at each time; where it changes, reset counters count on.
+    primary = np.asarray(data["primary_instance"], dtype=np.int64)
+    at = np.flatnonzero(np.diff(primary)) + 1
+    if at.size:
+        notes.append(
+            f"the primary estimator changes {at.size} times, first from {primary[at[0] - 1]} to {primary[at[0]]} at "
+            f"{_s(data['timestamp'])[at[0]]:.3f} s"
+        )
 
 
 def _whole_messages(data: bytes) -> tuple[bytes, list[tuple[int, int]]]:
@@ -306,26 +320,35 @@ def _imu(sets: dict[str, Data], notes: list[str]) -> Imu | None:
     return Imu(t[keep], flu_from_frd(gyro[keep]), flu_from_frd(accel[keep]))
 
 
-def _height(sets: dict[str, Data], odometry: Odometry | None, notes: list[str]) -> Height | None:
-    data = sets.get("distance_sensor")
-    if data is not None:
+def _looks(data: Data) -> int | None:
+    # The orientation of a rangefinder: down where any of its messages says so.
+    ways = np.asarray(data.get("orientation", ()), dtype=np.int64)
+    return None if not ways.size else DOWN if (ways == DOWN).any() else int(ways[0])
+
+
+def _height(log: Any, sets: dict[str, Data], odometry: Odometry | None, notes: list[str]) -> Height | None:
+    found = sorted((d for d in log.data_list if d.name == "distance_sensor"), key=lambda d: d.multi_id)
+    sensors = {
+        "distance_sensor" if len(found) == 1 else f"distance_sensor instance {d.multi_id}": d.data
+        for d in found
+    }
+    name = looking_down(notes, {n: _looks(data) for n, data in sensors.items()})
+    if name is not None:
+        data = sensors[name]
         t, d = _s(data["timestamp"]), np.asarray(data["current_distance"], dtype=np.float64)
         keep = np.isfinite(d) & (d > np.asarray(data.get("min_distance", 0.0))) & in_order(t)
         if "max_distance" in data:
             keep &= d < np.asarray(data["max_distance"])
-        if "orientation" in data and (np.asarray(data["orientation"]) == _DOWN).any():
-            keep &= np.asarray(data["orientation"]) == _DOWN
+        if "orientation" in data:
+            keep &= np.asarray(data["orientation"]) == DOWN
         if "signal_quality" in data:
             keep &= np.asarray(data["signal_quality"]) != 0
         tell_lost(
-            notes,
-            "distance_sensor",
-            int(keep.sum()),
-            len(keep),
-            "out of its range or order, or not of what is below",
+            notes, name, int(keep.sum()), len(keep), "out of its range or order, or not of what is below"
         )
         if keep.any():
-            return Height(t[keep], d[keep], "ground", "distance_sensor")
+            told = f", orientation {DOWN}" if len(found) > 1 else ""
+            return Height(t[keep], d[keep], "ground", f"{name}{told}")
     data = sets.get("vehicle_local_position")
     if data is not None and np.any(data.get("dist_bottom_valid", 0)):
         t = _s(data["timestamp"])

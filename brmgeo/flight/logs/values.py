@@ -20,6 +20,9 @@ from brmgeo.pictures import SUFFIXES
 MAX_REORDER_S = 0.5
 #: Endings of the files that count as photos of a camera.
 PHOTO_SUFFIXES = (*SUFFIXES, ".dng")
+#: MAV_SENSOR_ORIENTATION of a sensor that looks down, as PX4 and ArduPilot write it, too (ROTATION_PITCH_270).
+DOWN = 25
+_LOOKS = {0: "forward", 2: "right", 4: "back", 6: "left", 24: "up"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +241,28 @@ def tell_unread(notes: list[str], unread: Sequence[tuple[int, int]], size: int) 
             f"damaged at {places} at byte {unread[0][0]}: {lost} of {size} bytes ({lost / size:.2%}) could not be read and "
             "were passed over"
         )
+
+
+def looking_down(notes: list[str], sensors: dict[str, int | None]) -> str | None:
+    """The rangefinder whose distances are heights, of ``sensors`` (name -> orientation; None: not told); None of none.
+
+    Why others are not taken goes to ``notes``. One that is alone and tells no orientation is taken, which is noted.
+    """
+    down = [name for name, way in sensors.items() if way == DOWN]
+    if not down and len(sensors) == 1 and None in sensors.values():
+        down = list(sensors)
+        notes.append(f"{down[0]}: no orientation is told; its distances are taken as heights")
+    for name, way in sensors.items():
+        if name in down[:1]:
+            continue
+        why = (
+            f"it looks {_LOOKS.get(way, 'elsewhere than down')} (orientation {way})"
+            if way is not None
+            else ""
+        )
+        why = f"{down[0]} looks down, too, and comes first" if name in down else why
+        notes.append(f"{name} is not taken as height: {why or 'it tells no orientation'}")
+    return next(iter(down), None)
 
 
 def are_turns(wxyz: FloatArray) -> NDArray[np.bool_]:
