@@ -215,6 +215,80 @@ def test_photos_that_cannot_be_a_flight(tmp_path: Path) -> None:
         read_log(tmp_path / "nowhere")
 
 
+def test_a_gimbal_of_zeros_tells_no_attitude(tmp_path: Path) -> None:
+    log = read_log(shots(tmp_path, xmp=dji((0.0, 0.0, 0.0))))
+    assert log.attitude is None
+    assert any("0, 0, 0 in 4 of 4 photos: not told" in note for note in log.notes)
+
+
+def test_a_photo_that_is_dewarped_already_has_no_distortion(tmp_path: Path) -> None:
+    dewarp = 'drone-dji:DewarpData="2020-01-01;70.1,70.2,1.5,-2.5,-0.27,0.11,0.001,0.0002,-0.03" drone-dji:DewarpFlag="1"'
+    log = read_log(shots(tmp_path, 1, xmp=dji((0.0, -90.0, 5.0), more=dewarp)))
+    assert log.camera is not None
+    assert (log.camera.fx, log.camera.is_distorted) == (70.1, False)
+    assert any("DewarpFlag 1" in note for note in log.notes)
+
+
+def _marks(folder: Path, start_s: float, lat: float) -> None:
+    shots(folder, 2)
+    rows = [
+        f"{i + 1}\t{start_s + 2 * i:.6f}\t[2300]\t0,N\t0,E\t90,V\t{lat + i * 1e-4:.8f},Lat\t{LON0:.8f},Lon\t"
+        "180.5,Ellh\t0.011, 0.013, 0.030\t50,Q"
+        for i in range(2)
+    ]
+    (folder / "flight_Timestamp.MRK").write_text("\n".join(rows))
+
+
+def test_each_folder_has_its_own_time_marks(tmp_path: Path) -> None:
+    for name, start_s, lat in (("a", 100.0, 36.0), ("b", 200.0, 37.0)):
+        (tmp_path / name).mkdir()
+        _marks(tmp_path / name, start_s, lat)
+    log = read_log(tmp_path)
+    assert log.frames is not None
+    assert log.gnss is not None
+    assert log.frames.t_s == pytest.approx([0.0, 2.0, 100.0, 102.0])
+    assert log.gnss.lat_deg == pytest.approx([36.0, 36.0001, 37.0, 37.0001])
+    shots(tmp_path, 1)
+    with pytest.raises(FlightError, match=r"DJI_0001.JPG: no time mark file in its folder"):
+        read_log(tmp_path)
+    (tmp_path / "a" / "more.MRK").write_bytes((tmp_path / "a" / "flight_Timestamp.MRK").read_bytes())
+    with pytest.raises(FlightError, match="2 time mark files in one folder"):
+        read_log(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("crs", "x", "y"), [("EPSG:4326", 127.0, 37.5), ("EPSG:32652", 323_218.5, 4_152_176.6)]
+)
+def test_lists_of_opendronemap(tmp_path: Path, crs: str, x: float, y: float) -> None:
+    shots(tmp_path, 2)
+    rows = [f"DJI_{i + 1:04d}.JPG {x} {y} 150.0 30.0 0.0 0.0 0.05 0.1" for i in range(2)]
+    (tmp_path / "geo.txt").write_text("\n".join([crs, *rows]))
+    (tmp_path / "notes.txt").write_text("windy\nday\n")
+    (tmp_path / "base.obs").write_text("x")
+    log = read_log(tmp_path)
+    assert log.gnss is not None
+    assert log.gnss.lat_deg == pytest.approx([37.5, 37.5], abs=1e-3)
+    assert log.gnss.lon_deg == pytest.approx([127.0, 127.0], abs=1e-3)
+    assert log.gnss.sigma_m == pytest.approx([0.05, 0.05])
+    assert angles(log) == pytest.approx((0.0, 0.0, 30.0), abs=1e-6)
+    assert any("not read: notes.txt" in note for note in log.notes)
+    assert any("not read: 1 .obs" in note for note in log.notes)
+
+
+def test_a_list_that_names_photos_of_two_folders_alike_is_refused(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        shots(tmp_path / name, 1)
+    (tmp_path / "places.csv").write_text("name,lat,lon,t_s\nDJI_0001.JPG,36.5,128.5,1\n")
+    with pytest.raises(FlightError, match=r"places.csv:2: 2 photos are named dji_0001.jpg"):
+        read_log(tmp_path)
+    rows = ["name,lat,lon,t_s", "a/DJI_0001.JPG,36.5,128.5,1", "b/DJI_0001.JPG,36.6,128.5,2"]
+    (tmp_path / "places.csv").write_text("\n".join(rows))
+    gnss = read_log(tmp_path).gnss
+    assert gnss is not None
+    assert gnss.lat_deg == pytest.approx([36.5, 36.6])
+
+
 @pytest.mark.skipif(not (DATA / "photos-dji").is_dir(), reason="real photos are not here (BRMGEO_REAL_DATA)")
 def test_real_dji_photos_and_their_list_agree(tmp_path: Path) -> None:
     listed = read_log(DATA / "photos-dji")

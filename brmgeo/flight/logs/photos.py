@@ -11,8 +11,9 @@ import itertools
 import math
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from brmgeo.errors import FlightError, MissingInputError
+from brmgeo.errors import CrsError, FlightError, MissingInputError
 from brmgeo.flight.frames import (
     enu_flu_from_ned_frd,
     inverse,
@@ -30,6 +31,7 @@ from brmgeo.flight.frames import (
 )
 from brmgeo.flight.logs.values import PHOTO_SUFFIXES, CameraFrames, Gnss, Height, Log, LogOptions, Orientation
 from brmgeo.flight.readings import Camera, FloatArray
+from brmgeo.geo.crs import LONLAT, parse_crs, transformer
 
 _FULL_FRAME_DIAGONAL_MM = 43.2666
 #: Pitch that takes a camera that looks ahead to one that looks down.
@@ -55,6 +57,7 @@ class _Photo:
     camera_from: str = ""
     make: str = ""
     turned_by: str = ""
+    angles: tuple[float, float, float] | None = None  # as told, in degrees
     listed: bool = False
 
 
@@ -155,6 +158,14 @@ def _height(photos: list[_Photo], t: FloatArray) -> Height | None:
 
 
 def _attitude(photos: list[_Photo], t: FloatArray, notes: list[str]) -> Orientation | None:
+    # Zeros are what software writes that does not know the gimbal: no camera keeps to the horizon and to north that well.
+    blank = [p for p in photos if p.angles == (0.0, 0.0, 0.0)]
+    if blank:
+        notes.append(
+            f"{blank[0].turned_by}: roll, pitch and yaw are 0, 0, 0 in {len(blank)} of {len(photos)} photos: not told, so "
+            "no attitude is used"
+        )
+        return None
     turned = [p.wxyz for p in photos if p.wxyz is not None]
     if len(turned) == len(photos):
         return Orientation(t, np.stack(turned), True, photos[0].turned_by, of_camera=True)
@@ -268,7 +279,7 @@ def _vendor(photo: _Photo, tags: dict[str, str]) -> None:
         photo.above_takeoff = _number(tags.get("drone-dji:RelativeAltitude"))
         gimbal = _angles(tags, *(f"drone-dji:Gimbal{a}Degree" for a in ("Roll", "Pitch", "Yaw")))
         if gimbal is not None:
-            photo.wxyz = _ahead(*gimbal)
+            photo.wxyz, photo.angles = _ahead(*gimbal), gimbal
             photo.turned_by = "DJI gimbal"
         deviation = [_number(tags.get(f"drone-dji:RtkStd{a}")) for a in ("Lon", "Lat")]
         if all(math.isfinite(v) for v in deviation) and tags.get("drone-dji:RtkFlag", "0").strip() not in (
@@ -283,13 +294,13 @@ def _vendor(photo: _Photo, tags: dict[str, str]) -> None:
         return
     parrot = _angles(tags, *(f"drone-parrot:Camera{a}Degree" for a in ("Roll", "Pitch", "Yaw")))
     if parrot is not None:
-        photo.wxyz = _ahead(*parrot)
+        photo.wxyz, photo.angles = _ahead(*parrot), parrot
         photo.turned_by = "Parrot camera"
         return
     own = _angles(tags, "Camera:Roll", "Camera:Pitch", "Camera:Yaw")
     if own is not None:
         # Pix4D's and senseFly's zero pitch is straight down; others write that as -90.
-        photo.wxyz = _ahead(*own) if own[1] < -45.0 else _down(*own)
+        photo.wxyz, photo.angles = _ahead(*own) if own[1] < -45.0 else _down(*own), own
         photo.turned_by = "XMP Camera, pitch 0 is " + ("ahead" if own[1] < -45.0 else "straight down")
     accuracy = _number(tags.get("Camera:GPSXYAccuracy"))
     if math.isfinite(accuracy):
@@ -314,8 +325,11 @@ def _optics(photo: _Photo, detail: dict[int, Any], tags: dict[str, str]) -> None
         fx, fy, cx, cy = (v * smaller for v in dewarp[:4])
         k1, k2, p1, p2, k3 = dewarp[4:]
         cx, cy = width / 2 + cx - 0.5, height / 2 + cy - 0.5
-        camera = Camera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-        photo.camera, photo.camera_from = camera, "XMP DewarpData"
+        photo.camera, photo.camera_from = Camera(width, height, fx, fy, cx, cy), "XMP DewarpData"
+        if tags.get("drone-dji:DewarpFlag", "0").strip() == "1":
+            photo.camera_from += ", whose distortion is out of the photo already (DewarpFlag 1)"
+        else:
+            photo.camera = replace(photo.camera, distortion=(k1, k2, p1, p2, k3))
         return
     calibrated = _number(tags.get("drone-dji:CalibratedFocalLength"))
     if calibrated > 0.0:
@@ -361,50 +375,126 @@ _COLUMNS = {
 
 
 def _lists(folder: Path, photos: list[_Photo], notes: list[str]) -> None:
-    marks = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".mrk")
-    if marks:
-        _mrk(marks[0], photos, notes)
-        return
-    by_name = {p.path.name.lower(): p for p in photos}
-    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in (".csv", ".txt")):
-        text = path.read_bytes().decode("utf-8-sig", "replace")
-        lines = [line for line in text.splitlines() if line.strip()]
-        if len(lines) < 2:
-            continue
-        head = lines[0].lstrip("# ").strip()
+    # Places from what lies beside the photos: DJI's time marks, or the first list that tells places; the rest is told.
+    others = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
+    used: set[Path] = {p.path for p in photos}
+    marks = [p for p in others if p.suffix.lower() == ".mrk"]
+    _marks(marks, photos, notes)
+    used |= set(marks)
+    if not marks:
+        for path in (p for p in others if p.suffix.lower() in (".csv", ".txt")):
+            if _list(path, folder, photos, notes):
+                used.add(path)
+                break
+    unread = [p for p in others if p not in used]
+    lists = [p.name for p in unread if p.suffix.lower() in (".csv", ".txt")]
+    if lists:
+        why = (
+            "time marks go before them"
+            if marks
+            else "no header with name, latitude, longitude, or not the first"
+        )
+        notes.append(f"lists beside the photos that were not read: {', '.join(lists[:5])} ({why})")
+    kinds = Counter(p.suffix.lower() or p.name for p in unread if p.name not in lists)
+    if kinds:
+        told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+        notes.append(f"files beside the photos that were not read: {told}")
+
+
+def _list(path: Path, folder: Path, photos: list[_Photo], notes: list[str]) -> bool:
+    # Whether a list told places of photos, which then are theirs.
+    lines = path.read_bytes().decode("utf-8-sig", "replace").splitlines()
+    numbered = [(i, line) for i, line in enumerate(lines, start=1) if line.strip()]
+    if len(numbered) < 2:
+        return False
+    head = numbered[0][1].lstrip("# ").strip()
+    crs = _crs_line(head)
+    if crs is not None:
+        # OpenDroneMap's geo.txt: a CRS, then name x y [z] [yaw pitch roll] [horizontal and vertical accuracy].
+        names = ("name", "lon", "lat", "alt", "yaw", "pitch", "roll", "sigma")
+        where = {k: i for i, k in enumerate(names)}
+        rows = [line.split() for _, line in numbered[1:]]
+    else:
         cells = re.split(r"[,;\t]\s*|\s+" if "," not in head and ";" not in head else r"[,;]", head.lower())
         where = {k: cells.index(n) for k, names in _COLUMNS.items() for n in names if n in cells}
         if not {"name", "lat", "lon"} <= set(where):
+            return False
+        delimiter = next((d for d in ",;\t" if d in numbered[1][1]), " ")
+        rows = list(csv.reader([line for _, line in numbered[1:]], delimiter=delimiter))
+    named: dict[str, list[_Photo]] = {}
+    for p in photos:
+        for name in {p.path.name.lower(), p.path.relative_to(folder).as_posix().lower()}:
+            named.setdefault(name, []).append(p)
+    used = 0
+    for (number, _), row in zip(numbered[1:], rows):
+        name = row[where["name"]].strip().lower() if len(row) > where["name"] else ""
+        meant = named.get(name, [])
+        if len(meant) > 1:
+            raise FlightError(
+                f"{path}:{number}: {len(meant)} photos are named {name}: write their folders, too"
+            )
+        if not meant:
             continue
-        delimiter = next((d for d in ",;\t" if d in lines[1]), " ")
-        used = 0
-        for number, row in enumerate(csv.reader(lines[1:], delimiter=delimiter), start=2):
-            photo = by_name.get(row[where["name"]].strip().lower()) if len(row) > where["name"] else None
-            if photo is None:
-                continue
-            values = {
-                k: _number(row[i]) if i < len(row) else math.nan for k, i in where.items() if k != "name"
-            }
-            if not (abs(values["lat"]) <= 90.0 and abs(values["lon"]) <= 180.0):
-                raise FlightError(
-                    f"{path}:{number}: ({row[where['lon']]}, {row[where['lat']]}) is no place: check the header"
-                )
-            photo.lat, photo.lon = values["lat"], values["lon"]
-            photo.alt = values.get("alt", photo.alt)
-            photo.sigma = values.get("sigma", photo.sigma)
-            if math.isfinite(values.get("relative", math.nan)):
-                photo.above_takeoff, photo.listed = values["relative"], True
-            if math.isfinite(values.get("t", math.nan)):
-                photo.t_s = values["t"]
-            turn = [values.get(k, math.nan) for k in ("roll", "pitch", "yaw")]
-            if all(math.isfinite(v) for v in turn):
-                # An autopilot's list tells the aircraft's attitude, level at zero; a gimbal's tells -90 for down.
-                photo.wxyz = _ahead(*turn) if turn[1] < -45.0 else _down(*turn)
-                photo.turned_by = path.name
-            used += 1
-        if used:
-            notes.append(f"{path.name}: places of {used} of {len(photos)} photos taken from this list")
-            return
+        values = {k: _number(row[i]) if i < len(row) else math.nan for k, i in where.items() if k != "name"}
+        if crs is not None:
+            values["lon"], values["lat"] = transformer(crs, LONLAT).transform(values["lon"], values["lat"])
+        if not (abs(values["lat"]) <= 90.0 and abs(values["lon"]) <= 180.0):
+            raise FlightError(
+                f"{path}:{number}: ({row[where['lon']]}, {row[where['lat']]}) is no place: check the header"
+            )
+        _tell(meant[0], values, path.name)
+        used += 1
+    if used:
+        notes.append(f"{path.name}: places of {used} of {len(photos)} photos taken from this list")
+    return used > 0
+
+
+def _crs_line(head: str) -> str | None:
+    # The CRS that OpenDroneMap's lists begin with: an EPSG code, a PROJ string, or "WGS84 UTM 52N".
+    utm = re.fullmatch(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", head, re.IGNORECASE)
+    if utm:
+        return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}"
+    if not re.match(r"EPSG:|\+proj|WGS84$", head, re.IGNORECASE):
+        return None
+    try:
+        parse_crs(head)
+    except CrsError:
+        return None
+    return head
+
+
+def _tell(photo: _Photo, values: dict[str, float], source: str) -> None:
+    photo.lat, photo.lon = values["lat"], values["lon"]
+    photo.alt = values.get("alt", photo.alt)
+    photo.sigma = values.get("sigma", photo.sigma)
+    if math.isfinite(values.get("relative", math.nan)):
+        photo.above_takeoff, photo.listed = values["relative"], True
+    if math.isfinite(values.get("t", math.nan)):
+        photo.t_s = values["t"]
+    roll, pitch, yaw = (values.get(k, math.nan) for k in ("roll", "pitch", "yaw"))
+    if all(math.isfinite(v) for v in (roll, pitch, yaw)):
+        # An autopilot's list tells the aircraft's attitude, level at zero; a gimbal's tells -90 for down.
+        photo.wxyz = _ahead(roll, pitch, yaw) if pitch < -45.0 else _down(roll, pitch, yaw)
+        photo.turned_by, photo.angles = source, (roll, pitch, yaw)
+
+
+def _marks(marks: list[Path], photos: list[_Photo], notes: list[str]) -> None:
+    # A folder's marks are those of its photos; a mark file that is alone is that of all.
+    folders = [m.parent for m in marks]
+    for mark in marks:
+        if folders.count(mark.parent) > 1:
+            raise FlightError(
+                f"{mark}: {folders.count(mark.parent)} time mark files in one folder: put each into a folder with its photos"
+            )
+        own = photos if len(marks) == 1 else [p for p in photos if p.path.parent == mark.parent]
+        if not own:
+            raise FlightError(f"{mark}: no photo is in the folder of these time marks: put them together")
+        _mrk(mark, own, notes)
+    lost = [p for p in photos if len(marks) > 1 and p.path.parent not in folders]
+    if lost:
+        raise FlightError(
+            f"{lost[0].path}: no time mark file in its folder, but in {len(marks)} others: their times are not of one clock"
+        )
 
 
 def _mrk(path: Path, photos: list[_Photo], notes: list[str]) -> None:
@@ -421,8 +511,8 @@ def _mrk(path: Path, photos: list[_Photo], notes: list[str]) -> None:
         rows[int(numbers[0])] = numbers
     # The photo's own running number is the mark's; a flight that is one block may begin elsewhere.
     matched = 0
-    serial = {p.path.name: re.findall(r"\d+", p.path.stem) for p in photos}
-    keys = [int(s[-1]) if s else -1 for s in serial.values()]
+    serial = [re.findall(r"\d+", p.path.stem) for p in photos]
+    keys = [int(s[-1]) if s else -1 for s in serial]
     by_order = len(rows) == len(photos) and not set(keys) <= set(rows)
     for i, photo in enumerate(photos):
         row = rows.get(sorted(rows)[i] if by_order else keys[i])
