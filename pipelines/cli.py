@@ -956,7 +956,10 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
     help="The log's time at which the video begins, seconds.",
 )
 @click.option("--fov", "fov_deg", type=float, help="Field of view across the short side, degrees.")
-@click.option("--camera", type=_Numbers(), help="fx,fy,cx,cy[,k1,k2,p1,p2,k3] in pixels.")
+@click.option(
+    "--camera",
+    help="fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels, or a calibration file (Kalibr, OpenVINS, OpenCV, ROS, VINS).",
+)
 @click.option("--agl", "agl_m", type=float, help="Height above ground, metres, the same for all frames.")
 @click.option(
     "--ground", "ground_m", type=float, help="Height of the ground above the GNSS altitude's datum, metres."
@@ -1004,7 +1007,7 @@ def import_(
     video: Path | None,
     video_start_s: float,
     fov_deg: float | None,
-    camera: tuple[float, ...] | None,
+    camera: str | None,
     agl_m: float | None,
     ground_m: float | None,
     mount_deg: tuple[float, ...],
@@ -1015,7 +1018,9 @@ def import_(
     shift_frames_s: float,
 ) -> None:
     """Make a flight folder of LOG: a ROS bag, PX4 or ArduPilot log, text of poses, or a folder of geotagged photos."""
+    from brmgeo.flight.calibration import read_calibration
     from brmgeo.flight.logs import ImportSettings, LogOptions
+    from brmgeo.flight.readings import Camera
     from brmgeo.flight.tables import read_times
 
     from . import logs as job
@@ -1026,10 +1031,16 @@ def import_(
             raise SettingsError(f"import: --imu-units {unit!r} is unknown: known are deg/s, g, mg")
     if camera is not None and fov_deg is not None:
         raise SettingsError("import: --camera and --fov both tell the focal length: give one of them")
-    if camera is not None and len(camera) not in (4, 9):
-        raise SettingsError(
-            f"import: --camera has {len(camera)} numbers: give fx,fy,cx,cy or these and k1,k2,p1,p2,k3"
-        )
+    lens: Camera | tuple[float, ...] | None = None
+    if camera is not None and (Path(camera).exists() or camera.lower().endswith((".yaml", ".yml"))):
+        lens = read_calibration(Path(camera))
+    elif camera is not None:
+        lens = _Numbers().convert(camera, None, None)
+        if len(lens) not in (4, 8, 9):
+            raise SettingsError(
+                f"import: --camera has {len(lens)} numbers: give fx,fy,cx,cy, or these and k1,k2,p1,p2 or k1,k2,p1,p2,k3, "
+                "or a calibration file"
+            )
     options = LogOptions(
         topic=topic,
         image_topic=image_topic,
@@ -1045,7 +1056,7 @@ def import_(
         video=video,
         video_start_s=video_start_s,
         fov_deg=fov_deg,
-        camera=camera,
+        camera=lens,
         agl_m=agl_m,
         ground_m=ground_m,
         mount_deg=mount_deg,

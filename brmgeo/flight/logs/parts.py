@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import FlightError
 from brmgeo.flight import frames
+from brmgeo.flight.calibration import bend_of
 from brmgeo.flight.folder import MAX_AGL_M, MIN_AGL_M
 from brmgeo.flight.logs.pictures import Pictures
 from brmgeo.flight.logs.values import Gnss, Height, ImportSettings, Log, Orientation
@@ -53,9 +54,15 @@ def imported(path: Path, log: Log, pictures: Pictures | None, settings: ImportSe
         flown, chosen = _frames(path, log, height, pictures, settings, says)
         mount = (0.0, 0.0, 0.0) if is_of_camera(log) else settings.mount_deg
         video = pictures.video
+        camera = _camera(path, log, pictures, settings)
+        if settings.camera is not None:
+            named = zip(("fx", "fy", "cx", "cy"), (camera.fx, camera.fy, camera.cx, camera.cy))
+            bent = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion)
+            numbers = ", ".join(f"{name} {value:g}" for name, value in (*named, *bent))
+            says.append(f"camera: {camera.width} x {camera.height}, {numbers}")
         parts = replace(
             parts,
-            camera=_camera(path, log, pictures, settings),
+            camera=camera,
             mount=Attitude(*(math.radians(v) for v in mount)),
             frames=flown,
             video=None if video is None else (video.name, settings.video_start_s),
@@ -237,15 +244,16 @@ def _camera(path: Path, log: Log, pictures: Pictures, settings: ImportSettings) 
     width, height = pictures.size
     if settings.fov_deg is not None:
         return Camera.from_fov(width, height, settings.fov_deg)
-    if settings.camera is not None:
-        fx, fy, cx, cy, *bend = settings.camera
-        k1, k2, p1, p2, k3 = ([*bend] + [0.0] * 5)[:5]
-        return Camera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-    camera = log.camera or pictures.camera
+    told = settings.camera
+    if isinstance(told, tuple):
+        fx, fy, cx, cy, *bend = told
+        return Camera(width, height, fx, fy, cx, cy, bend_of("", bend))
+    camera = told or log.camera or pictures.camera
     if camera is None:
+        untold = "nothing tells the camera's field of view: give it in degrees across the short side"
         raise FlightError(
-            f"{path}: nothing tells the camera's field of view: give it in degrees across the short side",
-            needs="fov_deg",
+            f"{path}: {log.lens or untold}",
+            needs="camera" if log.lens else "fov_deg",
         )
     if (camera.width, camera.height) != (width, height):
         raise FlightError(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from brmgeo.errors import BrmgeoError, FlightError, InputError, MissingInputError, one_line
 from brmgeo.extras import extra
+from brmgeo.flight.calibration import bend_of
 from brmgeo.flight.logs.values import (
     CameraFrames,
     Gnss,
@@ -250,6 +251,7 @@ class _Gathered:
         self.size: tuple[int, int] | None = None
         self.suffix = ".png"
         self.camera: Camera | None = None
+        self.lens = ""
         self.frame_ids = ""
 
     def take(self, name: str, message: Any, recorded: int) -> None:
@@ -285,12 +287,12 @@ class _Gathered:
             self.streams[name].add(message.header.stamp, recorded, row)
         elif name == topics.range and message.min_range <= message.range <= message.max_range:
             self.streams[name].add(message.header.stamp, recorded, [message.range])
-        elif name == topics.info and self.camera is None:
-            self.camera = _camera(message)
-            if self.camera is None:
-                self.notes.append(
-                    f"{name}: its distortion model {message.distortion_model!r} or matrix is not used"
-                )
+        elif name == topics.info and self.camera is None and not self.lens:
+            try:
+                self.camera = _camera(message)
+            except FlightError as error:
+                self.lens = f"{name}: {error}"
+                self.notes.append(self.lens)
 
     def _first_picture(self, name: str, message: Any) -> None:
         image, self.suffix = _picture(self.path, message)
@@ -357,18 +359,20 @@ def _normal(path: Path, got: _Gathered, title: str, record_start_s: float) -> Lo
         gnss=gnss,
         frames=frames,
         camera=got.camera,
+        lens=got.lens,
         stamp_offset_s=offsets,
         notes=tuple(notes),
     )
 
 
-def _camera(info: Any) -> Camera | None:
+def _camera(info: Any) -> Camera:
     k = [float(v) for v in (info.k if hasattr(info, "k") else info.K)]
-    d = [float(v) for v in (info.d if hasattr(info, "d") else info.D)]
-    if k[0] <= 0 or info.distortion_model not in ("plumb_bob", "") or len(d) not in (0, 4, 5):
-        return None
-    k1, k2, p1, p2, k3 = (d + [0.0] * 5)[:5]
-    return Camera(int(info.width), int(info.height), k[0], k[4], k[2], k[5], (k1, k2, p1, p2, k3))
+    if k[0] <= 0:
+        raise FlightError(
+            "its camera is not calibrated (the matrix is zero): give the camera or its field of view"
+        )
+    bend = bend_of(str(info.distortion_model), info.d if hasattr(info, "d") else info.D)
+    return Camera(int(info.width), int(info.height), k[0], k[4], k[2], k[5], bend)
 
 
 def _picture(path: Path, message: Any) -> tuple[bytes | NDArray[np.uint8], str]:

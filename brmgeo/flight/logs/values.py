@@ -54,9 +54,9 @@ class ImportSettings:
     """What may be told besides the log when a flight is made of it.
 
     ``photos`` and ``video`` stand in for pictures that the log does not hold; ``video_start_s`` is the log's time at
-    which the video begins. ``camera`` is fx, fy, cx, cy[, k1, k2, p1, p2, k3]. ``body_deg`` and ``mount_deg`` are roll,
-    pitch, yaw: of the log's body in ours, and of the camera in the body. ``axes`` is one of ``frames.Axes``, or None
-    where it is to be found out that they are ours.
+    which the video begins. ``camera`` is a camera, or fx, fy, cx, cy[, k1, k2, p1, p2[, k3]].
+    ``body_deg`` and ``mount_deg`` are roll, pitch, yaw: of the log's body in ours, and of the camera in the body.
+    ``axes`` is one of ``frames.Axes``, or None where it is to be found out that they are ours.
     ``imu_units`` are units that the log is known to be in, such as ("deg/s", "g"). ``shift_frames_s`` is added to the
     frames' times.
     """
@@ -67,7 +67,7 @@ class ImportSettings:
     video: Path | None = None
     video_start_s: float = 0.0
     fov_deg: float | None = None
-    camera: tuple[float, ...] | None = None
+    camera: Camera | tuple[float, ...] | None = None
     agl_m: float | None = None
     ground_m: float | None = None
     mount_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -140,6 +140,7 @@ class Log:
         odometry: body FLU in a z-up frame; ``odometry.source`` names topic or messages.
         uses_gnss: True when the odometry is an estimate that GNSS went into, None when that is not known.
         candidates: every odometry that the log holds, for ``LogOptions.topic``.
+        lens: why the log's own calibration is not used, and what to do; empty where it is, or there is none.
         triggers_s: (n,) times at which the camera was triggered, for logs without pictures.
         stamp_offset_s: stream -> median of stamp minus record time, seconds, where both are known.
         lost: (start, seconds) of each dropout that the log reports.
@@ -160,6 +161,7 @@ class Log:
     gnss: Gnss | None = None
     frames: CameraFrames | None = None
     camera: Camera | None = None
+    lens: str = ""
     triggers_s: FloatArray | None = None
     stamp_offset_s: tuple[tuple[str, float], ...] = ()
     lost: tuple[tuple[float, float], ...] = ()
