@@ -31,7 +31,7 @@ from log_writers import (
 )
 
 from brmgeo.errors import FlightError, InputError, MissingExtraError, MissingInputError
-from brmgeo.flight.logs import Log, LogOptions, kind_of, read_log
+from brmgeo.flight.logs import Log, LogOptions, kind_of, read_log, rosbag
 from brmgeo.flight.logs.values import in_order, looking_down
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
 
@@ -434,3 +434,17 @@ def test_the_track_is_that_of_the_primary_core_and_begins_anew_at_a_switch(tmp_p
     assert log.odometry.segment is not None
     assert np.flatnonzero(np.diff(log.odometry.segment)).tolist() == [195]
     assert any("primary core changes 1 times, first from 0 to 1" in note for note in log.notes)
+
+
+def test_topics_that_nothing_is_taken_of_are_told() -> None:
+    class Connection:
+        topic, msgtype, msgcount = "/fmu/out/vehicle_odometry", "px4_msgs/msg/VehicleOdometry", 300
+
+    class Reader:
+        connections = (Connection(),)
+
+    notes: list[str] = []
+    rosbag._tell_left(Reader(), {"/imu"}, notes)
+    assert notes == [
+        "1 topics were not read, with messages: /fmu/out/vehicle_odometry (px4_msgs/msg/VehicleOdometry): 300"
+    ]

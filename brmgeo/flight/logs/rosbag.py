@@ -6,6 +6,7 @@ that were not set together. Body frames are FLU by REP-103 and taken as they are
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from brmgeo.errors import BrmgeoError, FlightError, InputError, MissingInputErro
 from brmgeo.extras import extra
 from brmgeo.flight.calibration import bend_of
 from brmgeo.flight.logs.values import (
+    DOWN,
     CameraFrames,
     Gnss,
     Height,
@@ -28,6 +30,7 @@ from brmgeo.flight.logs.values import (
     LogOptions,
     Orientation,
     choose,
+    looking_down,
     ordered,
     tell_lost,
     unit,
@@ -68,6 +71,10 @@ _COLOURS = {
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4} | dict.fromkeys(
     ("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), 2
 )
+
+
+#: Words in the names of rangefinders that look elsewhere -> MAV_SENSOR_ORIENTATION.
+_WAYS = {"front": 0, "forward": 0, "right": 2, "back": 4, "rear": 4, "left": 6, "up": 24, "upward": 24}
 
 
 @dataclass(slots=True)
@@ -175,9 +182,24 @@ def read_rosbag(path: Path, options: LogOptions | None = None) -> Log:
         for topic in sorted({c.topic for c in connections}):
             counted = sum(c.msgcount for c in connections if c.topic == topic)
             tell_lost(notes, topic, read[topic], counted, "counted by the bag but not found in it")
+        if not options.only_odometry:
+            _tell_left(reader, taken, notes)
         title = f"ROS {'2' if reader.is2 else '1'} bag, {len({c.topic for c in reader.connections})} topics"
         record_start = reader.start_time * 1e-9
     return _normal(path, got, title, record_start)
+
+
+def _tell_left(reader: Any, taken: set[str | None], notes: list[str]) -> None:
+    # Topics with messages that nothing was taken of, with their types.
+    left: dict[str, int] = {}
+    for c in reader.connections:
+        if c.topic not in taken and c.msgcount:
+            name = f"{c.topic} ({c.msgtype})"
+            left[name] = left.get(name, 0) + c.msgcount
+    if left:
+        told = ", ".join(f"{name}: {count}" for name, count in list(left.items())[:8])
+        more = f" and {len(left) - 8} more" if len(left) > 8 else ""
+        notes.append(f"{len(left)} topics were not read, with messages: {told}{more}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,11 +256,31 @@ def _chosen(path: Path, reader: Any, options: LogOptions, notes: list[str]) -> _
         image=image,
         imu=imu,
         fix=max(fixes, key=lambda name: fixes[name], default=None),
-        range=next(iter(_counts(reader, (_RANGE,)) if more else ()), None),
+        range=_range(reader, notes) if more else None,
         info=info,
         is_link=bool(topic and ">" in topic and topic in links),
         candidates=tuple(poses | links),
     )
+
+
+def _range(reader: Any, notes: list[str]) -> str | None:
+    # The rangefinder that looks down, by its topic's and frame's name: a Range tells no direction otherwise.
+    frames: dict[str, str] = {}
+    connections = [c for c in reader.connections if c.msgtype == _RANGE and c.msgcount]
+    for connection, _, raw in reader.messages(connections=connections) if connections else ():
+        if connection.topic not in frames:
+            message = reader.deserialize(raw, connection.msgtype)
+            frames[connection.topic] = f"{connection.topic} {message.header.frame_id}".lower()
+            if len(frames) == len({c.topic for c in connections}):
+                break
+    ways: dict[str, int | None] = {}
+    for topic, name in frames.items():
+        words = set(re.split(r"[^a-z]+", name))
+        down = words & {"down", "downward", "bottom", "ground", "nadir", "height", "altitude", "agl"}
+        other = next((way for word, way in _WAYS.items() if word in words), None)
+        ways[f"{topic} (frame {name.split(' ')[1]!r})"] = DOWN if down else other
+    chosen = looking_down(notes, ways)
+    return None if chosen is None else chosen.split(" ")[0]
 
 
 class _Gathered:
