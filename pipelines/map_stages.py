@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -123,7 +123,8 @@ def run_outlines(inputs: Inputs, out: Path, settings: OutlinesSettings, map: Map
     read.frame.to_parquet(out / "footprints.parquet")
     read.sheets.to_parquet(out / "sheets.parquet")
     repairs = [asdict(r) | {"source": name} for r in read.repairs]
-    rest = {"counts": read.counts, "repairs": repairs}
+    notes = [f"{name}: {note}" for note in read.notes]
+    rest = {"counts": read.counts, "repairs": repairs, **({} if len(read.frame) else {"notes": notes})}
     (out / "rest.json").write_text(json.dumps(rest, ensure_ascii=False), encoding="utf-8")
     examples: dict[str, list[Json]] = {}
     for repair in repairs:
@@ -138,7 +139,7 @@ def run_outlines(inputs: Inputs, out: Path, settings: OutlinesSettings, map: Map
         "counts": read.counts,
         "repairs": repair_counts(read.repairs),
         "examples": examples,
-        **({"notes": [f"{name}: {note}" for note in read.notes]} if read.notes else {}),
+        **({"notes": notes} if notes else {}),
     }
 
 
@@ -155,6 +156,7 @@ def read_outlines(folder: Path) -> Footprints:
         gpd.read_parquet(folder / "sheets.parquet"),
         [Repair(**row) for row in rest["repairs"]],
         rest["counts"],
+        rest.get("notes", []),  # of a file without footprints, to say why
     )
 
 
@@ -227,7 +229,7 @@ def _known_ground(
     if not boxes:
         raise InputError(
             f"{', '.join(inputs)}: no building outline in any of them, so the region has no place; "
-            "check the layers, or give --sheets or --bounds"
+            f"check the layers, or give --sheets or --bounds{_why_none(n for r in read for n in r.notes)}"
         )
     low, high = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
     basis = "bounding box of the footprints; state --sheets or --bounds where the map is known further"
@@ -262,6 +264,7 @@ def run_footprints(inputs: Inputs, out: Path, settings: CombineSettings, map: Ma
     if not len(whole.frame):
         raise InputError(
             f"{listed(list(inputs))}: no building outline in any of them; check [footprints] layers"
+            f"{_why_none(whole.notes)}"
         )
     write_footprints_gpkg(
         out / "footprints.gpkg",
@@ -275,6 +278,11 @@ def run_footprints(inputs: Inputs, out: Path, settings: CombineSettings, map: Ma
         "counts": whole.counts,
         "by_layer": {str(k): int(v) for k, v in whole.frame["layer"].value_counts().sort_index().items()},
     }
+
+
+def _why_none(notes: Iterable[str]) -> str:
+    told = list(notes)
+    return f" ({'; '.join(told[:2])})" if told else ""
 
 
 def _area_of_union(polygons: NDArray[np.object_]) -> float:

@@ -64,6 +64,12 @@ _FLOOR_COLUMNS = ("floors", "층수", "building:levels")
 # What GDAL, QuickOSM, osmtogeojson and Geofabrik call the identity of an OpenStreetMap object, and where its other keys are.
 _OSM_IDENTITY = {"osm_id", "osm_way_id", "osm_type", "full_id", "@id"}
 _OSM_KEYS = {"other_tags", "fclass", "landuse", "leisure", "amenity"}
+# Kinds of repairs that may have lost nothing, and what they left out then.
+_LEFT_OUT = {
+    "zero_area": "upright faces (walls)", "open": "open lines", "unreadable": "features without geometry",
+}  # fmt: skip
+# Of a frame's attrs: the rows whose geometry is there, but damaged.
+_DAMAGED = "damaged"
 _BUILDING_TAG = r"""["']building["']\s*(?:=>|:)\s*["']([^"']*)["']"""
 
 
@@ -160,7 +166,8 @@ def combine(parts: Sequence[Footprints], tolerance_m: float = EDGE_TOLERANCE_M) 
     frame, merged = merge_at_edges(frame[first].reset_index(drop=True), list(sheets.geometry), tolerance_m)
     totals = dict(counts) | {f"repair_{kind}": n for kind, n in repair_counts(repairs).items()}
     totals |= {"footprints": len(frame), "duplicates_across_sheets": len(twice), "merged_at_edges": merged}
-    return Footprints(frame, sheets, repairs, totals)
+    notes = [note for part in parts for note in part.notes]
+    return Footprints(frame, sheets, repairs, totals, notes)
 
 
 def merge_at_edges(
@@ -319,7 +326,7 @@ def _from_dxf(
         repairs=repairs,
         counts=read.counts,
         dropped_share=read.dropped_share,
-        notes=notes,
+        notes=notes + read.notes,
     )
 
 
@@ -356,6 +363,10 @@ def _from_vector(
         )
     target = crs or crs_name(native)
     require_projected_metres(target)
+    try:
+        transformer(native, target)
+    except CrsError as error:
+        raise CrsError(f"{path.name}: {error}", needs="source_crs") from error
     frame, notes = _buildings_of(frame, path.name)
     geometry = np.asarray(frame.geometry.values, dtype=object)
     polygons, row, open_rows, other = _polygons_of(geometry, snap_m)
@@ -376,8 +387,13 @@ def _from_vector(
         )
         x, y = transformer(native, target).transform(*xy[0]) if len(xy) else (math.nan, math.nan)
         repairs.append(Repair(kind, str(number[i]), name, float(x), float(y), detail, path.name))
-    outlines = len(polygons) + len(open_rows)
-    dropped = sum(repair.kind in DROPPED_KINDS for repair in repairs)
+    flat = _without_area(repairs, frame, row, set(handles[repaired.origin]))
+    left_out = +(Counter(_LEFT_OUT[repair.kind] for repair in flat) + Counter({"points": other}))
+    if left_out:
+        told = ", ".join(f"{n} {what}" for what, n in left_out.items())
+        notes.append(f"left out, as they have no area from above: {told}")
+    outlines = len(polygons) + len(open_rows) - len(flat)
+    dropped = sum(repair.kind in DROPPED_KINDS for repair in repairs) - len(flat)
     share = dropped / outlines if outlines else 0.0
     if share > max_dropped_share:
         raise InputError(
@@ -434,6 +450,10 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
                 frame = pyogrio.read_dataframe(
                     vector_file(whole), layer=layer, encoding=encoding, on_invalid="ignore"
                 )
+                missing = np.flatnonzero(frame.geometry.isna()) if "geometry" in frame else []
+                if len(missing):
+                    stored = pyogrio.raw.read(vector_file(whole), layer=layer, columns=[])[2]
+                    frame.attrs[_DAMAGED] = [int(i) for i in missing if stored[i] is not None]
                 counted = pyogrio.read_info(vector_file(whole))["features"] if suffix == ".fgb" else 0
                 if len(frame) < counted:
                     raise InputError(
@@ -606,6 +626,32 @@ def _polygons_of(
     out = np.empty(len(polygons), dtype=object)
     out[:] = polygons
     return out, np.array(row, dtype=np.int64), lost, others
+
+
+def _without_area(
+    repairs: Sequence[Repair], frame: gpd.GeoDataFrame, row: NDArray[np.int64], kept: set[str]
+) -> list[Repair]:
+    """Those repairs that dropped what never was an outline: walls of 3D shapes, lines beside areas, rows without geometry.
+
+    A flat feature that encloses nothing is an outline that was lost, and so are open lines where all outlines are lines, and
+    what GDAL read and GEOS could not.
+
+    Args:
+        repairs: of the file.
+        frame: its features.
+        row: the row that each closed outline came from.
+        kept: handles of the features that gave a footprint.
+    """
+    kinds = frame.geometry.iloc[row].geom_type
+    lines = bool(kinds.isin(["LineString", "MultiLineString", "LinearRing"]).all()) and len(row) > 0
+    solid = {str(n + 1) for n in frame.index[frame.geometry.has_z]}
+    damaged = {str(n + 1) for n in frame.attrs.get(_DAMAGED, ())}
+    never = {
+        "zero_area": lambda handle: handle in solid or handle in kept,
+        "open": lambda handle: not lines,
+        "unreadable": lambda handle: handle not in damaged,
+    }
+    return [repair for repair in repairs if repair.kind in never and never[repair.kind](repair.handle)]
 
 
 def _moved(geometry: NDArray[np.object_], src: str, dst: str) -> NDArray[np.object_]:

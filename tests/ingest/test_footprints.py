@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import sqlite3
@@ -177,6 +178,74 @@ def test_a_drawing_that_fits_in_no_unit_names_its_own(tmp_path):
         read_footprints(path, CRS)
 
 
+def test_walls_lines_points_and_empty_rows_are_no_lost_outlines(tmp_path):
+    floors = list(town(6).geometry)
+    faces = []
+    for floor in floors:
+        xy = shapely.get_coordinates(floor.exterior)
+        faces.append(shapely.force_3d(floor, 5.0))
+        faces += [shapely.Polygon([(*a, 0), (*b, 0), (*b, 5), (*a, 5)]) for a, b in itertools.pairwise(xy)]
+    wall = shapely.Polygon(shapely.get_coordinates(floors[1].exterior)[[0, 1, 0]])
+    shell = shapely.force_3d(shapely.MultiPolygon([floors[0], wall]), 0.0)
+    line, point = shapely.LineString([(0, 0), (9, 9), (9, 0)]), shapely.Point(0, 0)
+    for n, (shapes, told) in enumerate([
+        (faces, "24 upright faces (walls)"),
+        ([shapely.force_2d(shell), *floors[1:]], "1 upright faces (walls)"),
+        ([*floors, line, None, shapely.Polygon(), point], "1 open lines, 2 features without geometry, 1 points"),
+    ]):  # fmt: skip
+        path = write(gpd.GeoDataFrame(geometry=shapes, crs=CRS), tmp_path / f"{n}.gpkg")
+        read = read_footprints(path, CRS)
+        assert read.frame.area.sum() == pytest.approx(sum(floor.area for floor in floors))
+        assert read.notes == [f"left out, as they have no area from above: {told}"]
+        assert (read.counts["outlines"], read.sheets["dropped_share"].iat[0]) == (len(read.frame), 0.0)
+
+
+def test_flat_outlines_without_area_and_outlines_of_open_lines_are_lost(tmp_path):
+    floors = list(town(6).geometry)
+    flat = shapely.Polygon(shapely.get_coordinates(floors[1].exterior)[[0, 1, 0]])
+    lines = [floor.exterior for floor in floors[1:]]
+    for n, shapes in enumerate(([*floors, flat], [*lines, shapely.LineString([(0, 0), (9, 9), (9, 0)])])):
+        with pytest.raises(InputError, match=r"1 of . outlines .* are not usable"):
+            read_footprints(write(gpd.GeoDataFrame(geometry=shapes, crs=CRS), tmp_path / f"{n}.gpkg"), CRS)
+
+
+def test_a_crs_without_a_place_on_earth_is_mended_by_the_source_crs(tmp_path):
+    path = write(town(4).set_crs(CRS, allow_override=True), tmp_path / "t.shp")
+    path.with_suffix(".prj").write_text('LOCAL_CS["Nonearth",UNIT["Meter",1.0]]')
+    with pytest.raises(CrsError, match=r"t\.shp: no transformation leads from Nonearth") as raised:
+        read_footprints(path, CRS)
+    assert raised.value.needs == "source_crs"
+    assert len(read_footprints(path, CRS, source_crs=CRS).frame) == 4
+
+
+def test_what_a_drawing_has_and_is_not_read_is_told(tmp_path):
+    left, bottom, *_ = sheet_extent(NUMBER, CRS)
+    ring = [
+        (left + 300, bottom + 300),
+        (left + 310, bottom + 300),
+        (left + 310, bottom + 308),
+        (left + 300, bottom + 308),
+    ]
+    document = ezdxf.new("R2010", units=6)
+    space, site = document.modelspace(), document.blocks.new("SITE")
+    site.add_lwpolyline(ring, close=True, dxfattribs={"layer": "HOUSE"})
+    space.add_lwpolyline(ring, close=True, dxfattribs={"layer": "Plot"})
+    space.add_spline([(*p, 0) for p in ring], dxfattribs={"layer": "HOUSE"})
+    space.add_hatch(dxfattribs={"layer": "HOUSE"})
+    document.saveas(tmp_path / "a.dxf")
+    read = read_footprints(tmp_path / "a.dxf", CRS, layers=["HOUSE"])
+    assert read.notes == [
+        "on HOUSE left out, as they are no outlines: 1 HATCH, 1 SPLINE",
+        "no outline is on HOUSE; lines are on PLOT",
+    ]
+    space.add_blockref("SITE", (0, 0))
+    document.saveas(tmp_path / "b.dxf")
+    assert read_footprints(tmp_path / "b.dxf", CRS, layers=["HOUSE"]).notes[1] == (
+        "outlines on HOUSE in blocks that are put on other layers are left out, 1 in SITE: explode the blocks"
+    )
+    assert read_footprints(tmp_path / "a.dxf", CRS, layers=["PLOT"]).notes == []
+
+
 def test_floors_are_read_out_of_text(tmp_path):
     frame = town(4).rename(columns={"종류": "Kind"})
     frame["층수"] = ["3층", None, "x", "12"]
@@ -199,6 +268,8 @@ def test_faults_are_repaired_and_told(tmp_path):
     }
     assert [r.handle for r in read.repairs if r.kind == "bow_tie"] == ["31"]
     assert len(read.frame) == 32
+    flat = shapely.Polygon([(x, y), (x + 5, y), (x, y)])
+    path = write(gpd.GeoDataFrame(geometry=[*shapes[:-1], flat], crs=CRS), tmp_path / "t.gpkg")
     with pytest.raises(InputError, match="1 of 34 outlines"):
         read_footprints(path, CRS, max_dropped_share=0.01)
 

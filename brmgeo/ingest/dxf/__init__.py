@@ -23,6 +23,7 @@ Texts are never decoded, so a wrong or missing code page cannot fail a sheet.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,10 +33,18 @@ import shapely
 from numpy.typing import NDArray
 
 from brmgeo.codes import BUILDING_KINDS, BUILDING_LAYERS, GROUP_BOUNDARY_LAYER, NEATLINE_LAYER, layer_code
-from brmgeo.errors import InputError, SettingsError
+from brmgeo.errors import InputError, SettingsError, listed
 from brmgeo.extras import extra
 from brmgeo.ingest.dxf.chains import DrawnRings, close
-from brmgeo.ingest.dxf.entities import MIN_BLOCK_AREA_M2, block_lines, in_modelspace, lines_on
+from brmgeo.ingest.dxf.entities import (
+    MIN_BLOCK_AREA_M2,
+    block_lines,
+    blocks_left_out,
+    in_modelspace,
+    kinds_left_out,
+    layers_drawn_on,
+    lines_on,
+)
 from brmgeo.ingest.dxf.tags import Tags, text_of
 from brmgeo.ingest.repair import DROPPED_KINDS, ClosedOutlines, Repair, repair_counts, repair_rings
 
@@ -69,6 +78,7 @@ class SheetFootprints:
             symbols_ignored, other_entities (on wanted layers, not outlines) and one ``repair_KIND`` a kind.
         dropped_share: outlines dropped / outlines found, in [0, 1].
         drawn_in: the unit that $INSUNITS names, in words, and its metres; None where it names none.
+        notes: what of the wanted layers was not read, a line each.
     """
 
     footprints: gpd.GeoDataFrame
@@ -77,6 +87,7 @@ class SheetFootprints:
     counts: dict[str, int] = field(default_factory=dict)
     dropped_share: float = 0.0
     drawn_in: tuple[str, float] | None = None
+    notes: list[str] = field(default_factory=list)
 
 
 def read_dxf(
@@ -151,7 +162,34 @@ def read_dxf(
     neatline = _neatline(tags, snap_m / unit_m, sagitta_m / unit_m)
     if neatline is not None:
         neatline = _in_metres(np.array([neatline], dtype=object), unit_m)[0]
-    return SheetFootprints(frame, neatline, repairs, counts, share, _unit(tags))
+    notes = _left_out(tags, wanted, counts)
+    return SheetFootprints(frame, neatline, repairs, counts, share, _unit(tags), notes)
+
+
+def _left_out(tags: Tags, wanted: dict[bytes, str], counts: dict[str, int]) -> list[str]:
+    """What a user should know of what was not read."""
+    assert tags.entities is not None
+    heads = in_modelspace(tags, np.arange(*tags.entities))
+    names = listed(list(dict.fromkeys(wanted.values())))
+    notes = []
+    if counts["other_entities"]:
+        kinds = kinds_left_out(tags, heads, wanted)
+        notes.append(f"on {names} left out, as they are no outlines: {_numbered(kinds, '')}")
+    blocks = blocks_left_out(tags, heads, wanted)
+    if blocks:
+        notes.append(
+            f"outlines on {names} in blocks that are put on other layers are left out, {_numbered(blocks, 'in ')}: "
+            "explode the blocks"
+        )
+    elif not counts["outlines"]:
+        layers = layers_drawn_on(tags, heads)
+        there = f"lines are on {listed(sorted(layers), 12)}" if layers else "there are no lines at all"
+        notes.append(f"no outline is on {names}; {there}")
+    return notes
+
+
+def _numbered(found: Counter[str], between: str) -> str:
+    return listed([f"{n} {between}{what}" for what, n in sorted(found.items())], 12)
 
 
 def _in_metres(polygons: NDArray[np.object_], unit_m: float) -> NDArray[np.object_]:

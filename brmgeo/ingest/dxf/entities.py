@@ -18,6 +18,7 @@ from brmgeo.ingest.dxf.tags import Tags
 MIN_BLOCK_AREA_M2 = 4.0
 
 _OUTLINE_TYPES = (b"LWPOLYLINE", b"POLYLINE", b"LINE", b"ARC", b"CIRCLE")
+_NEVER_OUTLINES = (b"VERTEX", b"SEQEND", b"INSERT", b"TEXT", b"MTEXT", b"ATTRIB", b"POINT")
 
 
 @dataclass(slots=True)
@@ -45,9 +46,7 @@ def lines_on(
     """Outline entities among ``heads`` whose layer is wanted, in file order."""
     types = tags.types[heads]
     outline = np.isin(types, _OUTLINE_TYPES)
-    other = ~outline & ~np.isin(
-        types, (b"VERTEX", b"SEQEND", b"INSERT", b"TEXT", b"MTEXT", b"ATTRIB", b"POINT")
-    )
+    other = ~outline & ~np.isin(types, _NEVER_OUTLINES)
     layer = tags.names(tags.first(heads, 8))
     on_layer = np.isin(layer, list(wanted))
     counts["other_entities"] = counts.get("other_entities", 0) + int((other & on_layer).sum())
@@ -312,6 +311,41 @@ def block_lines(
             taken += 1
     counts["blocks_as_buildings"], counts["symbols_ignored"] = taken, len(inserts) - taken
     return out
+
+
+def kinds_left_out(tags: Tags, heads: NDArray[np.int64], wanted: Iterable[bytes]) -> Counter[str]:
+    """Entities on the wanted layers that are drawn but not read, by kind: splines, hatches, faces, meshes."""
+    heads = heads[np.isin(tags.names(tags.first(heads, 8)), list(wanted))]
+    types = tags.types[heads]
+    mesh = (types == b"POLYLINE") & ((tags.integers(tags.first(heads, 70)) & (16 | 64)) != 0)
+    other = heads[mesh | ~np.isin(types, (*_OUTLINE_TYPES, *_NEVER_OUTLINES))]
+    return Counter(kind.decode("ascii", errors="replace") for kind in tags.types[other].tolist())
+
+
+def layers_drawn_on(tags: Tags, heads: NDArray[np.int64]) -> Counter[str]:
+    """Names of layers, in upper case, by the number of entities on them that could be outlines."""
+    outlines = heads[np.isin(tags.types[heads], _OUTLINE_TYPES)]
+    return Counter(_text(name) for name in tags.names(tags.first(outlines, 8)).tolist())
+
+
+def blocks_left_out(tags: Tags, heads: NDArray[np.int64], wanted: Iterable[bytes]) -> Counter[str]:
+    """Blocks that are put on other layers but hold outlines of the wanted ones, by the number of those."""
+    inserts = heads[tags.types[heads] == b"INSERT"]
+    inserts = inserts[~np.isin(tags.names(tags.first(inserts, 8)), list(wanted))]
+    blocks = _block_heads(tags) if len(inserts) else {}
+    found: Counter[str] = Counter()
+    for name in set(tags.names(tags.first(inserts, 2)).tolist()) & set(blocks):
+        held = blocks[name][0]
+        held = held[np.isin(tags.types[held], _OUTLINE_TYPES)]
+        found[_text(name)] = int(np.isin(tags.names(tags.first(held, 8)), list(wanted)).sum())
+    return +found
+
+
+def _text(name: bytes) -> str:
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode("cp949", errors="replace")
 
 
 def _block_heads(tags: Tags) -> dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]]:
