@@ -161,6 +161,7 @@ def cli() -> None:
 @click.option("--crs", help="With --footprints: the region's CRS, projected in metres, such as EPSG:5187.")
 @click.option("--out", type=DATA, help="Where results go (default data/out/REGION).")
 @click.option("--imagery", type=FILE, help="With --footprints: a GeoTIFF, or a folder or pattern of them.")
+@click.option("--imagery-crs", help="With --imagery: the CRS of images that do not say theirs (world files).")
 @click.option("--sheets", help="With --footprints: NGII sheets that the files cover; the map is known there.")
 @click.option(
     "--bounds", type=_Numbers(4), help="With --footprints: left,bottom,right,top where the map is known."
@@ -187,6 +188,7 @@ def maps(
     crs: str | None,
     out: Path | None,
     imagery: Path | None,
+    imagery_crs: str | None,
     sheets: str | None,
     bounds: tuple[float, ...] | None,
     gsd_m: float | None,
@@ -211,6 +213,7 @@ def maps(
             footprints,
             crs=crs,
             imagery=imagery,
+            imagery_crs=imagery_crs,
             sheets=sheets,
             bounds=bounds,
             gsd_m=gsd_m,
@@ -229,6 +232,7 @@ def maps(
     given: dict[str, object] = {
         "--crs": crs,
         "--imagery": imagery,
+        "--imagery-crs": imagery_crs,
         "--sheets": sheets,
         "--bounds": bounds,
         "--radii": radii_m,

@@ -202,7 +202,7 @@ def _is_placed(path: Path) -> bool:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             with open_raster(path) as src:
-                return not src.transform.is_identity or bool(src.gcps[0])
+                return not src.transform.is_identity or bool(src.gcps[0]) or src.rpcs is not None
         except (InputError, RasterioError):
             return True  # the adapter says what is wrong with it
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from brmgeo import files
-from brmgeo.errors import MissingInputError
+from brmgeo.errors import MissingInputError, SettingsError
 from brmgeo.region import MapSettings
 from brmgeo.settings import checked
 from brmgeo.workflow.plan import StepStatus
@@ -107,6 +107,7 @@ def maps_of_files(
     *,
     crs: str,
     imagery: Path | None = None,
+    imagery_crs: str | None = None,
     sheets: str | None = None,
     bounds: Sequence[float] | None = None,
     gsd_m: float | None = None,
@@ -120,6 +121,10 @@ def maps_of_files(
 
     A region file must say where the region is; here the footprints may.
     """
+    if imagery_crs is not None and imagery is None:
+        raise SettingsError(
+            "maps --footprints: the CRS of imagery is stated, but no imagery", needs="imagery"
+        )
     for path in (*footprints, *([imagery] if imagery else [])):
         if not path.exists():
             raise MissingInputError(f"maps --footprints: {path} is not there; correct the path")
@@ -139,7 +144,9 @@ def maps_of_files(
             "crs": source_crs,
             "repairs_layer": repairs,
         },
-        "imagery": None if imagery is None else {"kind": "raster", "path": str(imagery.absolute())},
+        "imagery": None
+        if imagery is None
+        else {"kind": "raster", "path": str(imagery.absolute()), "crs": imagery_crs},
     }
     if gsd_m is not None:
         asked["gsd_m"] = gsd_m

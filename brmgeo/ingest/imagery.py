@@ -268,6 +268,16 @@ def _plane_of(source: ImagerySource) -> Iterator[_Plane]:
             crs, affine = _ortho_place(source, src, placed)
         else:
             if not placed:
+                if points := len(src.gcps[0]) or src.rpcs:
+                    by = (
+                        f"{points} control points (GCPs)"
+                        if isinstance(points, int)
+                        else "a camera model (RPC)"
+                    )
+                    raise InputError(
+                        f"{path} is placed by {by}, not upright: warp it first, as with gdalwarp -t_srs EPSG:5187 "
+                        f"{path.name} {path.stem}-upright.tif"
+                    )
                 raise InputError(
                     f"{path} has no georeferencing: put its world file (such as {path.stem}.tfw or .jgw) beside it, "
                     "or, for an NGII orthophoto, state its sheet number"
@@ -277,14 +287,22 @@ def _plane_of(source: ImagerySource) -> Iterator[_Plane]:
 
 
 def _file_crs(source: GeoRaster, src: Any) -> str:
-    """The CRS of a raster file, where it and the user must not contradict each other."""
-    own = None
+    """The CRS of a raster file, where it and the user must not contradict each other; else that of the .prj beside it.
+
+    One without a place on earth, as CAD programs and GDAL write it for "none", is as good as none.
+    """
+    own, local = None, ""
     if src.crs is not None:
         epsg = src.crs.to_epsg()
         own = f"EPSG:{epsg}" if epsg else src.crs.to_wkt()
+    elif source.crs is None:
+        own = _crs_beside(source.path)
+    if own is not None and parse_crs(own).is_engineering:
+        own, local = None, f" on earth, only {crs_name(own)!r}"
     if own is None and source.crs is None:
         raise CrsError(
-            f"{source.path} states no coordinate reference system: state its crs, such as crs = 'EPSG:5187'"
+            f"{source.path} states no coordinate reference system{local}: state its crs, such as crs = 'EPSG:5187'",
+            needs="imagery_crs",
         )
     if own is None or source.crs is None:
         name = source.crs or own or ""
@@ -296,6 +314,21 @@ def _file_crs(source: GeoRaster, src: Any) -> str:
             "correct the file"
         )
     return own
+
+
+def _crs_beside(image: Path) -> str | None:
+    """The CRS of the .prj beside an image with a world file, None where there is none; CrsError for a damaged one."""
+    for path in sorted(image.parent.iterdir()):
+        if path.stem == image.stem and path.suffix.lower() == ".prj":
+            try:
+                text = path.read_text(encoding="utf-8", errors="replace").strip()
+                parse_crs(text)
+            except (OSError, CrsError) as error:
+                raise CrsError(
+                    f"{path} cannot be read as a CRS: {one_line(error)}", needs="imagery_crs"
+                ) from error
+            return text
+    return None
 
 
 def _ortho_place(source: NgiiOrtho, src: Any, placed: bool) -> tuple[str, Affine]:

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from PIL import Image
+from rasterio.control import GroundControlPoint
 from rasterio.enums import ColorInterp
 from rasterio.warp import Resampling, reproject
 
 from brmgeo.errors import CrsError, InputError, MissingInputError
-from brmgeo.geo.crs import transformer
+from brmgeo.geo.crs import parse_crs, transformer
 from brmgeo.geo.grid import Window, blocks, bounds_of, lattice
 from brmgeo.geo.sheets import sheet_extent
 from brmgeo.geo.tilegrid import KakaoGrid, Tile, TileGrid, WebMercatorGrid
@@ -275,6 +276,34 @@ def test_kinds_of_rasters(tmp_path: Path) -> None:
     rgb, known = mosaic_to_lattice(photo, BOX)
     assert known.all()
     assert np.abs(rgb - truth(BOX)).max() < 6
+    # What the .prj says counts where nobody says otherwise.
+    (tmp_path / "photo.PRJ").write_text(parse_crs(EAST).to_wkt("WKT1_ESRI"))
+    np.testing.assert_array_equal(mosaic_to_lattice(GeoRaster(tmp_path / "photo.jpg"), BOX)[0], rgb)
+    (tmp_path / "photo.PRJ").write_text("no crs")
+    with pytest.raises(CrsError, match=r"photo\.PRJ cannot be read as a CRS") as raised:
+        mosaic_to_lattice(GeoRaster(tmp_path / "photo.jpg"), BOX)
+    assert raised.value.needs == "imagery_crs"
+    np.testing.assert_array_equal(mosaic_to_lattice(photo, BOX)[0], rgb)
+
+
+def test_a_crs_without_a_place_on_earth_is_as_good_as_none(tmp_path: Path) -> None:
+    image = np.full((3, 220, 300), 90, np.uint8)
+    local = 'LOCAL_CS["site grid",UNIT["metre",1]]'
+    shape = {"width": 300, "height": 220, "count": 3, "dtype": "uint8", "crs": local, "transform": BOX.affine}
+    with rasterio.open(tmp_path / "local.tif", "w", driver="GTiff", **shape) as out:
+        out.write(image)
+    with pytest.raises(CrsError, match=r"local\.tif states no .*on earth.*state its crs"):
+        mosaic_to_lattice(GeoRaster(tmp_path / "local.tif"), BOX)
+    assert mosaic_to_lattice(GeoRaster(tmp_path / "local.tif", crs=EAST), BOX)[1].all()
+
+
+def test_an_image_placed_by_control_points_says_so(tmp_path: Path) -> None:
+    points = [GroundControlPoint(r, c, 175000 + c / 2, 563110 - r / 2) for r in (0, 220) for c in (0, 300)]
+    shape = {"width": 300, "height": 220, "count": 3, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "gcp.tif", "w", driver="GTiff", crs=EAST, gcps=points, **shape) as out:
+        out.write(np.full((3, 220, 300), 90, np.uint8))
+    with pytest.raises(InputError, match=r"placed by 4 control points \(GCPs\).*gdalwarp"):
+        mosaic_to_lattice(GeoRaster(tmp_path / "gcp.tif"), BOX)
 
 
 def test_ngii_ortho_by_its_sheet_number(tmp_path: Path) -> None:

@@ -146,6 +146,18 @@ def test_sheets_elsewhere_than_the_bounds(region: SmallRegion, maps: Callable[[]
     assert maps().error
 
 
+def test_layers_that_a_drawing_does_not_have(tmp_path: Path, capsys: Capture) -> None:
+    empty_dxf(tmp_path / "a.dxf")
+    words = ("--crs", CRS, "--bounds", ",".join(map(str, BOUNDS)), "--out", tmp_path / "out")
+    answer = brmgeo(capsys, "maps", "--footprints", tmp_path / "a.dxf", *words)
+    says(
+        answer,
+        "no building outline in any of them",
+        "a.dxf: no outline is on B0014111",
+        "lines are on A0013112",
+    )
+
+
 # --- imagery --------------------------------------------------------------------------------------------------
 
 
@@ -384,6 +396,7 @@ def test_files_of_one_name_and_awkward_names(shapefile: Path, capsys: Capture, t
         (("--crs", CRS, "--out", "OUT", "--radii", "a,b"), ("--radii",)),
         (("--crs", CRS, "--out", "OUT", "--layer", "roads"), ("buildings.shp",)),
         (("--crs", CRS, "--out", "OUT", "--imagery", "/nowhere.tif"), ("/nowhere.tif",)),
+        (("--crs", CRS, "--out", "OUT", "--imagery-crs", CRS), ("no imagery", "(--imagery ")),
         (("--crs", CRS, "--out", "OUT", "--footprints", "/nowhere.shp"), ("/nowhere.shp",)),
         (("small", "--crs", CRS, "--out", "OUT"), ("not both",)),
         (("--crs", CRS, "--out", "OUT", "--scheduler", "dask"), ("dask", "tcp://")),
