@@ -450,8 +450,8 @@ def _vector_frame(path: Path, layer: str | None, encoding: str | None) -> gpd.Ge
                 frame = pyogrio.read_dataframe(
                     vector_file(whole), layer=layer, encoding=encoding, on_invalid="ignore"
                 )
-                missing = np.flatnonzero(frame.geometry.isna()) if "geometry" in frame else []
-                if len(missing):
+                if isinstance(frame, gpd.GeoDataFrame) and frame.geometry.isna().any():
+                    missing = np.flatnonzero(frame.geometry.isna())
                     stored = pyogrio.raw.read(vector_file(whole), layer=layer, columns=[])[2]
                     frame.attrs[_DAMAGED] = [int(i) for i in missing if stored[i] is not None]
                 counted = pyogrio.read_info(vector_file(whole))["features"] if suffix == ".fgb" else 0

@@ -298,7 +298,8 @@ def _file_crs(source: GeoRaster, src: Any) -> str:
     elif source.crs is None:
         own = _crs_beside(source.path)
     if own is not None and parse_crs(own).is_engineering:
-        own, local = None, f" on earth, only {crs_name(own)!r}"
+        local = f" on earth, only {crs_name(own)!r}"
+        own = None
     if own is None and source.crs is None:
         raise CrsError(
             f"{source.path} states no coordinate reference system{local}: state its crs, such as crs = 'EPSG:5187'",
