@@ -30,8 +30,8 @@ from brmgeo.synth.flight import Imagery, RaisedFootprints, SimulationSettings, s
 from pipelines.cli import cli, run
 
 # The everyday run is the same for everyone; pytest --hypothesis-profile=explore looks further.
-hypothesis_settings.register_profile("everyday", derandomize=True)
-hypothesis_settings.register_profile("explore", derandomize=False)
+hypothesis_settings.register_profile("everyday", derandomize=True, deadline=None)
+hypothesis_settings.register_profile("explore", derandomize=False, deadline=None)
 hypothesis_settings.load_profile("everyday")
 
 

@@ -202,8 +202,8 @@ def _odometry(
     if attitude is not None and stream == "EKF1":
         # EKF1 tells angles late in some versions.
         wxyz = mixed(attitude.t_s, attitude.wxyz, rows[:, 0])
-    segment = rows[:, 7].astype(np.int64) if rows[-1, 7] > rows[0, 7] else None
-    return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream, segment)
+    part = rows[:, 7].astype(np.int64) if rows[-1, 7] > rows[0, 7] else None
+    return tuple(counts), Odometry(rows[:, 0], enu_from_ned(rows[:, 1:4]), wxyz, stream, part)
 
 
 def _imu(found: Messages, time: Clock, notes: list[str]) -> Imu | None:
