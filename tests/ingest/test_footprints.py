@@ -241,9 +241,13 @@ def test_what_a_drawing_has_and_is_not_read_is_told(tmp_path):
     space.add_blockref("SITE", (0, 0))
     document.saveas(tmp_path / "b.dxf")
     assert read_footprints(tmp_path / "b.dxf", CRS, layers=["HOUSE"]).notes[1] == (
-        "outlines on HOUSE in blocks that are put on other layers are left out, 1 in SITE: explode the blocks"
+        "no outline is on HOUSE but in blocks that are put on other layers, 1 in SITE: explode the blocks"
     )
     assert read_footprints(tmp_path / "a.dxf", CRS, layers=["PLOT"]).notes == []
+    # A symbol on another layer of a drawing that has its outlines is no building.
+    space.add_lwpolyline(ring, close=True, dxfattribs={"layer": "HOUSE"})
+    document.saveas(tmp_path / "c.dxf")
+    assert len(read_footprints(tmp_path / "c.dxf", CRS, layers=["HOUSE"]).notes) == 1
 
 
 def test_floors_are_read_out_of_text(tmp_path):

@@ -175,13 +175,15 @@ def _left_out(tags: Tags, wanted: dict[bytes, str], counts: dict[str, int]) -> l
     if counts["other_entities"]:
         kinds = kinds_left_out(tags, heads, wanted)
         notes.append(f"on {names} left out, as they are no outlines: {_numbered(kinds, '')}")
+    if counts["outlines"]:
+        return notes  # blocks of other layers are symbols then
     blocks = blocks_left_out(tags, heads, wanted)
     if blocks:
         notes.append(
-            f"outlines on {names} in blocks that are put on other layers are left out, {_numbered(blocks, 'in ')}: "
+            f"no outline is on {names} but in blocks that are put on other layers, {_numbered(blocks, 'in ')}: "
             "explode the blocks"
         )
-    elif not counts["outlines"]:
+    else:
         layers = layers_drawn_on(tags, heads)
         there = f"lines are on {listed(sorted(layers), 12)}" if layers else "there are no lines at all"
         notes.append(f"no outline is on {names}; {there}")
