@@ -724,6 +724,11 @@ def localize(
     help="Hide this half of the map and fly over it: nothing may be found.",
 )
 @click.option(
+    "--conditions",
+    help="Fly under conditions of real flights, a row each: some of long-legs, tilted, tilted-near, poor-masks, old-map, "
+    "photos (all together); default: plain flights.",
+)
+@click.option(
     "--masks",
     "masks",
     help="Compare masks over the same flights: some of true, network (on rendered frames), degraded (to pixel accuracy "
@@ -756,6 +761,7 @@ def evaluate(
     path: str,
     scale_bias: float,
     hide: str | None,
+    conditions: str | None,
     masks: str | None,
     weights: Path | None,
     looks: int | None,
@@ -792,10 +798,17 @@ def evaluate(
             / (f"hidden-{hide}" if hide else path if path in PATHS else "waypoints")
         )
         # What is flown otherwise goes beside the plain table, not over it.
-        kind = "".join(f"-{w}" for w in ("masks" if masks else "", "sift" if sift else "", season or "") if w)
+        told = (
+            "conditions" if conditions else "",
+            "masks" if masks else "",
+            "sift" if sift else "",
+            season or "",
+        )
+        kind = "".join(f"-{w}" for w in told if w)
         out = out.with_name(out.name + kind)
-    chosen, kinds = (
-        tuple(m.strip() for m in (text or "").split(",") if m.strip()) for text in (methods, masks)
+    chosen, kinds, under = (
+        tuple(dict.fromkeys(m.strip() for m in (text or "").split(",") if m.strip()))
+        for text in (methods, masks, conditions)
     )
     if (weights is not None or looks is not None) and "network" not in kinds:
         raise SettingsError(
@@ -824,7 +837,7 @@ def evaluate(
             sift=sift,
             drawn=drawn,
         )
-        click.echo(job.evaluate(job.Evaluation(first, flights, out, scheduler)))
+        click.echo(job.evaluate(job.Evaluation(first, flights, out, scheduler, under)))
     if region is not None:
         note_flown(built.name, data, out)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brmgeo.errors import MissingInputError, SettingsError, WorkflowError
+from brmgeo.evaluate.conditions import CONDITIONS
 from brmgeo.evaluate.table import FlightRow, markdown, plain, read_row, rows_csv, summarize
 from brmgeo.evaluate.trials import MASKS, PAPER_ACCURACY, Trial, fly_trial
 from brmgeo.files import list_written, require_writable, set_aside, write_text
@@ -28,7 +29,8 @@ class Evaluation:
 
     Attributes:
         trial: the first flight; the others have the seeds after its own.
-        flights: how many.
+        flights: how many, under each of the conditions.
+        conditions: names of ``CONDITIONS`` to fly under; none for plain flights.
         out: folder of flights.csv and summary.md.
         scheduler_spec: what runs them, see ``scheduler``.
     """
@@ -37,11 +39,16 @@ class Evaluation:
     flights: int
     out: Path
     scheduler_spec: str | None = None
+    conditions: tuple[str, ...] = ()
 
     @property
     def trials(self) -> list[Trial]:
         """All flights."""
-        return [replace(self.trial, seed=self.trial.seed + i) for i in range(self.flights)]
+        return [
+            replace(self.trial, seed=self.trial.seed + i, condition=condition)
+            for condition in self.conditions or (None,)
+            for i in range(self.flights)
+        ]
 
 
 def evaluate(what: Evaluation) -> str:
@@ -74,13 +81,13 @@ def evaluate(what: Evaluation) -> str:
                 rows += result
                 _write(what.out, TABLES[0], rows_csv(rows))
     if not rows:
-        raise WorkflowError(f"evaluate: none of {what.flights} flights could be flown; {broken[0]}")
+        raise WorkflowError(f"evaluate: none of {len(what.trials)} flights could be flown; {broken[0]}")
     note = _note(what, maps, shown, broken)
     summaries = summarize(rows)
     _write(what.out, TABLES[1], f"{note}\n\n{markdown(summaries)}")
     if broken:
         raise WorkflowError(
-            f"evaluate: {len(broken)} of {what.flights} flights broke off ({broken[0]}); the others are in {table}"
+            f"evaluate: {len(broken)} of {len(what.trials)} flights broke off ({broken[0]}); the others are in {table}"
         )
     return f"{note}\n\n{plain(summaries)}\n\nwritten: {table}, {what.out / 'summary.md'}"
 
@@ -97,6 +104,13 @@ def check_evaluation(what: Evaluation, maps: Maps) -> None:
         raise SettingsError(f"--flights {what.flights}: give 1 or more")
     if trial.sift and trial.hide is not None:
         raise SettingsError("--sift matches the imagery, which --hide does not hide: leave out one of them")
+    for name in what.conditions:
+        if name not in CONDITIONS:
+            raise SettingsError(f"--conditions: {name!r} is not known: choose among {', '.join(CONDITIONS)}")
+    if what.conditions and (trial.masks is not None or trial.sift):
+        raise SettingsError(
+            "--conditions have masks of their own and no frames: leave out --masks and --sift"
+        )
     kinds = () if trial.masks is None else trial.masks.kinds
     for kind in kinds:
         if kind not in MASKS:
@@ -141,13 +155,15 @@ def _note(what: Evaluation, maps: Maps, shown: str, broken: Sequence[str]) -> st
     where = "over ground that the map does not show" if trial.hide else "over built-up ground"
     frameless = "masks-only " if trial.masks is None and not trial.sift else ""
     note = (
-        f"{what.flights - len(broken)} simulated {frameless}flights ({path_name(trial.path)}, seeds "
+        f"{len(what.trials) - len(broken)} simulated {frameless}flights ({path_name(trial.path)}, seeds "
         f"{trial.seed} to {trial.seed + what.flights - 1}) {where} of {maps.folder.name}; "
         f"odometry: simulated, scale bias {trial.scale_bias:+.0%} or the opposite, heading drift 0.75 deg per root minute; "
         f"{shown}. Nothing is aligned before it is scored."
     )
+    if what.conditions:
+        note += " Conditions: " + "; ".join(f"{n}: {CONDITIONS[n].told}" for n in what.conditions) + "."
     if broken:
-        note += f" {len(broken)} of {what.flights} flights broke off and are not in the table: {'; '.join(broken)}."
+        note += f" {len(broken)} of {len(what.trials)} flights broke off and are not in the table: {'; '.join(broken)}."
     return note
 
 

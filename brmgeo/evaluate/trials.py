@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brmgeo.errors import MissingInputError
+from brmgeo.evaluate.conditions import CONDITIONS, long_legs
 from brmgeo.evaluate.scores import score
 from brmgeo.evaluate.sift import sift_fixes
 from brmgeo.evaluate.table import FlightRow
@@ -102,6 +103,7 @@ class Trial:
         masks: kinds of masks to fly with; None for the simulator's alone, without frames.
         sift: also match frames to the imagery.
         drawn: what frames are drawn from.
+        condition: what else is as on real flights; None for nothing.
     """
 
     maps_dir: Path
@@ -114,6 +116,7 @@ class Trial:
     masks: MaskComparison | None = None
     sift: bool = False
     drawn: FrameSource = FrameSource()
+    condition: str | None = None
 
 
 def fly_trial(trial: Trial) -> list[FlightRow]:
@@ -129,7 +132,15 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
         known, bounds = hide_half(maps, trial.hide)
     sign = 1.0 if trial.seed % 2 else -1.0
     settings = simulator_settings(trial.own, odometry=OdometryErrors(scale_bias=sign * trial.scale_bias))
-    route = flight_path(trial.path, ground, trial.seed, bounds, maps.crs)
+    condition = None if trial.condition is None else CONDITIONS[trial.condition]
+    if condition is not None:
+        settings = condition.settings(settings, trial.seed)
+        known = condition.ground(known, trial.seed)
+    if condition is not None and condition.long_legs:
+        course, route = "legs", long_legs(bounds, settings, trial.seed)
+    else:
+        course = path_name(trial.path)
+        route = flight_path(trial.path, ground, trial.seed, bounds, maps.crs)
     # Frames show roofs where their height puts them, and so do the masks that are compared with the network's.
     relief = trial.masks is not None
     flown = simulate_views(ground, route, settings, trial.seed, maps.ground.gsd_m, relief=relief)
@@ -138,7 +149,8 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
     seen = {"": flown.views}
     if trial.masks is not None:
         seen = {kind: scene.views(kind, trial.masks, flown.views) for kind in trial.masks.kinds}
-    flight = f"{path_name(trial.path)}-{trial.seed}"
+    flight = f"{course}-{trial.seed}"
+    under = f", {trial.condition}" if trial.condition else ""
     rows = []
     for method in trial.methods:
         for kind, views in seen.items():
@@ -147,7 +159,7 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
                 FlightRow(
                     flight=flight,
                     seed=trial.seed,
-                    method=f"{method}, {kind} masks" if kind else method,
+                    method=f"{method}, {kind} masks" if kind else method + under,
                     scores=score(located.estimates, located.smoothed.xy, flown.motions, truth),
                     seconds_per_frame=float(located.seconds.mean()),
                     first_frame_s=float(located.seconds[0]),
@@ -250,14 +262,14 @@ class _TrialFlight:
     def _gsd_m(self, i: int) -> float:
         """Metres per pixel at the middle of a frame, by what the aircraft measured."""
         agl_m = float(self.course.measured_agl_m[i])
-        return slant_gsd_m(self.settings.camera, self.settings.mount, *self._attitude_rad(i), agl_m)
+        return slant_gsd_m(self.settings.camera, self.settings.known_mount, *self._attitude_rad(i), agl_m)
 
     def _measured_view(self, i: int, image: NDArray[Any], roof_m: float, gsd_m: float) -> View:
         """A frame's picture or mask, levelled by what the aircraft measured, laid onto the plane at ``roof_m``."""
         return make_view(
             image,
             self.settings.camera,
-            self.settings.mount,
+            self.settings.known_mount,
             *self._attitude_rad(i),
             above_roofs_m(float(self.course.measured_agl_m[i]), roof_m),
             gsd_m,

@@ -24,17 +24,28 @@ def read(tmp_path: Path, text: str) -> SimulationSettings:
 def test_every_setting_of_the_simulator_can_be_given(tmp_path: Path) -> None:
     for section, model in (("", SimulationSettings), ("masks", MaskErrors), ("odometry", OdometryErrors)):
         for field in fields(model):
-            if field.name in ("camera", "mount", "masks", "odometry"):
+            if field.name in ("camera", "mount", "told_mount", "masks", "odometry"):
                 continue
-            value = {"reset_times_s": [20.0, 60], "jpeg_quality": 77}.get(field.name, 0.75)
+            value = {"reset_times_s": [20.0, 60], "jpeg_quality": 77, "states_noise": True}.get(
+                field.name, 0.75
+            )
             if field.name == "agl_m":
                 value = 120
+            shown = str(value).lower() if isinstance(value, bool) else value
             head = f"[{section}]\n" if section else ""
-            made = read(tmp_path, f"{head}{field.name} = {value}\n")
+            made = read(tmp_path, f"{head}{field.name} = {shown}\n")
             owner = getattr(made, section) if section else made
             got = getattr(owner, field.name)
             assert got == (tuple(value) if isinstance(value, list) else value), field.name
             assert isinstance(got, type(getattr(model(), field.name)) | float)
+
+
+def test_a_told_mount_is_what_the_flight_is_located_with(tmp_path: Path) -> None:
+    made = read(tmp_path, "[mount]\npitch_deg = -15.0\n")
+    assert made.known_mount == made.mount
+    made = read(tmp_path, "[mount]\npitch_deg = -15.0\n[told_mount]\npitch_deg = 0.0\n")
+    assert made.mount.pitch_rad == pytest.approx(math.radians(-15.0))
+    assert made.known_mount.pitch_rad == 0.0
 
 
 def test_the_example_of_the_docs_holds(tmp_path: Path) -> None:

@@ -306,7 +306,7 @@ class Simulator:
         return make_view(
             image,
             self.settings.camera,
-            self.settings.mount,
+            self.settings.known_mount,
             math.radians(c.measured_roll_deg[frame]),
             math.radians(c.measured_pitch_deg[frame]),
             float(c.measured_agl_m[frame]),

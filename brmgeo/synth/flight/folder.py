@@ -76,7 +76,7 @@ def simulate(
         name=name or f"simulated-{seed}",
         simulated=True,
         camera=settings.camera,
-        mount=settings.mount,
+        mount=settings.known_mount,
         frames=_frames(course, crs),
         odometry=None if settings.odometry is None else odometry_of(course, settings.odometry, seed),
         imu=imu_of(course, seed) if pictures else None,

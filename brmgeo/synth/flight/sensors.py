@@ -47,7 +47,10 @@ def odometry_of(course: Course, errors: OdometryErrors, seed: int) -> Odometry:
     wxyz = np.round(quaternion_from_euler(rpy[:, 0], rpy[:, 1], rpy[:, 2] + turn), 9)
     wxyz /= np.linalg.norm(wxyz, axis=1, keepdims=True)
     keep = ~silent
-    return Odometry(np.round(t, 6)[keep], np.round(track, 4)[keep], wxyz[keep], "odometry.tum")
+    gathered = np.round(errors.noise_m_sqrt_s**2 * (t - t[0]), 6)[keep] if errors.states_noise else None
+    return Odometry(
+        np.round(t, 6)[keep], np.round(track, 4)[keep], wxyz[keep], "odometry.tum", walk_m2=gathered
+    )
 
 
 def imu_of(course: Course, seed: int) -> Imu:

@@ -60,6 +60,7 @@ class OdometryErrors:
         scale_bias: the bias itself: 0.05 makes every step 5 % too long.
         drift_deg_sqrt_min: heading random walk, degrees per root minute.
         noise_m_sqrt_s: position random walk per axis, metres per root second.
+        states_noise: the odometry says itself what its steps are worth: ``noise_m_sqrt_s``, as a covariance.
         reset_times_s: at each of these times the filter starts again: two seconds of silence, then a new origin and yaw.
         rate_hz: poses a second.
     """
@@ -68,6 +69,7 @@ class OdometryErrors:
     scale_bias: Annotated[float, Field(ge=-0.9, le=10.0)] | None = None
     drift_deg_sqrt_min: NotNegative = 0.75
     noise_m_sqrt_s: NotNegative = 0.05
+    states_noise: bool = False
     reset_times_s: tuple[NotNegative, ...] = ()
     rate_hz: Annotated[float, Field(ge=0.5, le=100.0)] = 10.0
 
@@ -83,6 +85,7 @@ class SimulationSettings:
 
     Attributes:
         camera, mount: the camera and how it sits in the body.
+        told_mount: how the flight says that the camera sits; None for as it does.
         speed_m_s, frame_interval_s, agl_m: cruise.
         agl_sigma_m: slow changes of height about ``agl_m``.
         wobble_deg: standard deviation of roll and pitch about the flight's own.
@@ -103,6 +106,7 @@ class SimulationSettings:
 
     camera: Camera = field(default_factory=lambda: Camera.from_fov(640, 480, 43.0))
     mount: Attitude = field(default_factory=Attitude)
+    told_mount: Attitude | None = None
     speed_m_s: Annotated[float, Field(ge=0.1, le=200.0)] = 5.0
     frame_interval_s: Annotated[float, Field(ge=0.02, le=60.0)] = 5.0
     agl_m: Annotated[float, Field(ge=5.0, le=5000.0)] = 150.0
@@ -122,6 +126,11 @@ class SimulationSettings:
     vignette: Share = 0.15
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92
     sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 152.0
+
+    @property
+    def known_mount(self) -> Attitude:
+        """The mount that whoever locates the flight goes by."""
+        return self.mount if self.told_mount is None else self.told_mount
 
 
 def require_possible(settings: SimulationSettings) -> None:

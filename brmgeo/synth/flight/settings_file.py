@@ -15,6 +15,7 @@ from brmgeo.settings import Toml, build, read_toml
 from brmgeo.synth.flight.settings import SimulationSettings
 
 _Pixels = Annotated[int, Field(ge=8, le=30000)]
+_MOUNTS = ("mount", "told_mount")
 _Focal = Annotated[float, Field(ge=1.0)]
 
 
@@ -23,20 +24,23 @@ def read_simulation_settings(path: Path, base: SimulationSettings) -> Simulation
 
     Top-level keys are those of ``SimulationSettings`` (``agl_sigma_m``, ``exposure_s``, ``noise_levels``, ...), ``[masks]``
     and ``[odometry]`` those of ``MaskErrors`` and ``OdometryErrors``; ``[camera]`` and ``[mount]`` are as in flight.toml.
+    ``[told_mount]`` is the mount that flight.toml gets where that is another.
 
     Raises MissingInputError when there is no such file, SettingsError for what is not TOML, a key that nobody knows
     (with the nearest one) and a value of another type or out of range.
     """
     toml = read_toml(path)
-    plain = {key: value for key, value in toml.data.items() if key not in ("camera", "mount")}
+    plain = {key: value for key, value in toml.data.items() if key not in ("camera", *_MOUNTS)}
     made = build(replace(toml, data=plain), SimulationSettings, base)
     if "camera" in toml.data:
         made = replace(made, camera=_camera(toml, base.camera))
-    if "mount" in toml.data:
-        own = (math.degrees(v) for v in (base.mount.roll_rad, base.mount.pitch_rad, base.mount.yaw_rad))
-        turns = build(toml, _MountKeys, _MountKeys(*own), at=("mount",))
-        angles = (turns.roll_deg, turns.pitch_deg, turns.yaw_deg)
-        made = replace(made, mount=Attitude(*(math.radians(v) for v in angles)))
+    for key in _MOUNTS:
+        if key in toml.data:
+            before = getattr(base, key) or made.mount
+            own = (math.degrees(v) for v in (before.roll_rad, before.pitch_rad, before.yaw_rad))
+            turns = build(toml, _MountKeys, _MountKeys(*own), at=(key,))
+            angles = (turns.roll_deg, turns.pitch_deg, turns.yaw_deg)
+            made = replace(made, **{key: Attitude(*(math.radians(v) for v in angles))})
     return made
 
 
