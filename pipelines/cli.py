@@ -156,7 +156,7 @@ def cli() -> None:
     "--footprints",
     type=FILE,
     multiple=True,
-    help="Build from these files, without a region file; repeatable.",
+    help="Build from these files, without a region file: a file, a folder or a pattern; repeatable.",
 )
 @click.option("--crs", help="With --footprints: the region's CRS, projected in metres, such as EPSG:5187.")
 @click.option("--out", type=DATA, help="Where results go (default data/out/REGION).")
@@ -595,6 +595,24 @@ def simulate(
     help="Metres per second that bound the movement where there is no odometry (default: the region's, 20).",
 )
 @click.option(
+    "--odometry-sigma",
+    type=_Numbers(),
+    help="Noise of an odometry step per axis: METRES, or METRES,SHARE of its length (default 0.15,0.01; beside what the "
+    "odometry states itself).",
+)
+@click.option(
+    "--compass-sigma",
+    "compass_sigma_deg",
+    type=click.FloatRange(0.1, 180),
+    help="With --compass: its standard deviation, degrees (default 8.6).",
+)
+@click.option(
+    "--tilt-sigma",
+    "tilt_sigma_deg",
+    type=click.FloatRange(0, 11.4),
+    help="Standard deviation of roll and pitch, mount included, degrees (default 0.2).",
+)
+@click.option(
     "--odometry",
     type=click.Choice(["auto", "given"]),
     default="auto",
@@ -637,6 +655,9 @@ def localize(
     seed: int,
     compass: bool,
     max_speed_m_s: float | None,
+    odometry_sigma: tuple[float, ...] | None,
+    compass_sigma_deg: float | None,
+    tilt_sigma_deg: float | None,
     odometry: str,
     sift: bool,
     masks: str,
@@ -657,6 +678,19 @@ def localize(
 
     if flight is not None:
         _refuse_given("is that of a simulated flight, and --flight is there already: leave one out", "seed")
+    if not compass:
+        _refuse_given("is of the compass: give --compass too", "compass_sigma_deg")
+    if method == "paper":
+        sensors = ("odometry_sigma", "compass_sigma_deg", "tilt_sigma_deg")
+        _refuse_given(
+            "is nothing that --method paper weighs: leave it out, or choose mask or ratio", *sensors
+        )
+    if odometry_sigma is not None and len(odometry_sigma) > 2:
+        raise SettingsError(
+            f"localize: --odometry-sigma has {len(odometry_sigma)} numbers: give METRES or METRES,SHARE"
+        )
+    step_m, step_share = (*(odometry_sigma or ()), None, None)[:2]
+    known = job.Sensors(step_m, step_share, compass_sigma_deg, tilt_sigma_deg)
     built = maps_for("localize", region, maps_dir, data, scheduler)
     if flight is None:
         if built.region is None:
@@ -685,6 +719,7 @@ def localize(
         compass=compass,
         sift=sift,
         max_speed_m_s=max_speed_m_s,
+        sensors=known,
         odometry=odometry,
         network=use,
         attribution=built.attribution,

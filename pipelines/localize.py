@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +19,40 @@ from brmgeo.geo.grid import as_bounds
 from brmgeo.locate.flights import locate_flight
 from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import NetworkUse, frame_masks
-from brmgeo.match import METHODS
+from brmgeo.match import METHODS, MatchSettings
 from brmgeo.region import FlightSettings
 from brmgeo.workflow.disk import disk_errors
 from brmgeo.workflow.progress import Progress
 from brmgeo.workflow.schedule import serial_map
 
 from .flight_results import FlightResults, is_result, source_of, write_results
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What somebody knows of an aircraft's sensors, as standard deviations; None where nothing is known.
+
+    Attributes:
+        step_m, step_share: of an odometry step per axis: metres, and as a share of its length.
+        compass_deg: of the compass.
+        tilt_deg: of roll and pitch.
+    """
+
+    step_m: float | None = None
+    step_share: float | None = None
+    compass_deg: float | None = None
+    tilt_deg: float | None = None
+
+    def settings(self, base: MatchSettings) -> MatchSettings:
+        """A matcher's settings with what is known; SettingsError for a number out of range."""
+        known = {
+            "step_sigma_m": self.step_m,
+            "step_sigma_share": self.step_share,
+            "compass_sigma_rad": None if self.compass_deg is None else math.radians(self.compass_deg),
+            "attitude_sigma_rad": None if self.tilt_deg is None else math.radians(self.tilt_deg),
+        }
+        given = {name: value for name, value in known.items() if value is not None}
+        return replace(base, odometry=replace(base.odometry, **given)) if given else base
 
 
 def localize(
@@ -36,6 +65,7 @@ def localize(
     compass: bool = False,
     sift: bool = False,
     max_speed_m_s: float | None = None,
+    sensors: Sensors | None = None,
     network: NetworkUse | None = None,
     odometry: str = "auto",
     attribution: str = "",
@@ -44,8 +74,8 @@ def localize(
 
     A flight without odometry gets its own from its frames, where they are dense enough, unless ``odometry`` is "given".
     ``out`` is replaced as a whole, at the end: a run that fails leaves what was there. ``max_speed_m_s`` bounds the
-    movement where odometry says nothing (default: the region's). ``network`` says where masks come from (default: the
-    flight's own where it has some, else the network that ships with brmgeo).
+    movement where odometry says nothing (default: the region's); ``sensors`` says what the sensors are worth. ``network``
+    says where masks come from (default: the flight's own where it has some, else the network that ships with brmgeo).
     """
     if method not in METHODS:
         raise SettingsError(f"METHOD {method!r} is not known: choose one of {', '.join(METHODS)}")
@@ -65,6 +95,9 @@ def localize(
             needs="sift",
         )
     own = flight_settings or FlightSettings()
+    if max_speed_m_s is not None:
+        own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
+    settings = (sensors or Sensors()).settings(match_settings(own))
     if odometry == "auto":
         tried = own_odometry(flight, own.interval_s)
         flight = tried.flight
@@ -85,9 +118,6 @@ def localize(
             "without",
             needs="compass",
         )
-    if max_speed_m_s is not None:
-        own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
-    settings = match_settings(own)
     given, use = f"{source_of(flight)}: masks/ of the flight folder", network or NetworkUse()
     with frame_masks(flight, given, use, progress, maps.folder.name) as masks:
         with progress.stage(f"{flight.name} {method}") as bar:

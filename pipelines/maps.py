@@ -101,6 +101,19 @@ def _write_facts(region: MapSettings, made: Mapping[str, Artifact], path: Path) 
         files.write_json(path, facts)
 
 
+def _matching(pattern: Path) -> list[Path]:
+    if not glob.has_magic(str(pattern)):
+        raise MissingInputError(f"maps --footprints: {pattern} is not there; correct the path")
+    found = [Path(p) for p in sorted(glob.glob(str(pattern), recursive=True))]
+    # As in a folder: what lies beside a shapefile is no file of its own.
+    found = [p for p in found if p.is_dir() or p.suffix.lower() in VECTOR_SUFFIXES]
+    if not found:
+        raise MissingInputError(
+            f"maps --footprints: no footprints ({', '.join(VECTOR_SUFFIXES)}) are called {pattern}; correct the pattern"
+        )
+    return found
+
+
 def maps_of_files(
     out: Path,
     footprints: Sequence[Path],
@@ -125,11 +138,12 @@ def maps_of_files(
         raise SettingsError(
             "maps --footprints: the CRS of imagery is stated, but no imagery", needs="imagery"
         )
-    for path in (*footprints, *([imagery] if imagery else [])):
-        if not path.exists():
-            raise MissingInputError(f"maps --footprints: {path} is not there; correct the path")
+    # A name that is there is no pattern, whatever its characters.
+    named = [p for path in footprints for p in ([path] if path.exists() else _matching(path))]
+    if imagery is not None and not imagery.exists():
+        raise MissingInputError(f"maps --footprints: {imagery} is not there; correct the path")
     numbers = tuple(s.strip() for s in sheets.split(",") if s.strip()) if sheets else ()
-    found = dict.fromkeys(p.absolute() for path in footprints for p in _files_of(path))
+    found = dict.fromkeys(p.absolute() for path in named for p in _files_of(path))
     name = out.absolute().name
     asked: dict[str, Any] = {
         "name": safe_name(name),

@@ -278,14 +278,46 @@ def test_without_odometry_nothing_false_is_said(
     maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said]
 ) -> None:
     without_odometry(flight)
-    words = ("--compass", "--max-speed", "8")
+    words = (
+        "--compass",
+        "--max-speed",
+        "8",
+        "--odometry-sigma",
+        "20,0.05",
+        "--compass-sigma",
+        "5",
+        "--tilt-sigma",
+        "3",
+    )
     said = say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "out", *words)
     assert said.code == 0, said.err
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert metrics["odometry"] == "none"
     assert metrics["odometry_rmse_m"] is None
     assert metrics["false_fixes"] == 0
-    assert metrics["settings"]["odometry"]["max_speed_m_s"] == 8
+    used = metrics["settings"]["odometry"]
+    assert used["max_speed_m_s"] == 8
+    assert (used["step_sigma_m"], used["step_sigma_share"]) == (20, 0.05)
+    assert used["compass_sigma_rad"] == pytest.approx(math.radians(5))
+    assert used["attitude_sigma_rad"] == pytest.approx(math.radians(3))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--compass-sigma", "5"), "--compass-sigma is of the compass: give --compass too"),
+        (("--tilt-sigma", "3", "--method", "paper"), "--tilt-sigma is nothing that --method paper weighs"),
+        (("--odometry-sigma", "1,2,3"), "--odometry-sigma has 3 numbers"),
+        (("--odometry-sigma", "-1"), "step_sigma_m = -1.0 is outside [0, 100]"),
+    ],
+)
+def test_what_is_said_of_sensors_and_changes_nothing_is_refused(
+    maps: Path, flight: Path, tmp_path: Path, say: Callable[..., Said], words: tuple[str, ...], told: str
+) -> None:
+    said = say("localize", "--maps", maps, "--flight", flight, "--out", tmp_path / "out", *words)
+    assert said.code == 2
+    assert told in said.err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -18,6 +18,7 @@ from PIL import Image
 from small_maps import BOUNDS, CRS, LEVEL, SHEETS, Answer, SmallRegion, brmgeo, rasters_of
 
 from brmgeo.workflow.store import Store
+from pipelines.maps import maps_of_files
 
 FIRST, SECOND = SHEETS
 Capture = pytest.CaptureFixture[str]
@@ -398,6 +399,7 @@ def test_files_of_one_name_and_awkward_names(shapefile: Path, capsys: Capture, t
         (("--crs", CRS, "--out", "OUT", "--imagery", "/nowhere.tif"), ("/nowhere.tif",)),
         (("--crs", CRS, "--out", "OUT", "--imagery-crs", CRS), ("no imagery", "(--imagery ")),
         (("--crs", CRS, "--out", "OUT", "--footprints", "/nowhere.shp"), ("/nowhere.shp",)),
+        (("--crs", CRS, "--out", "OUT", "--footprints", "/nowhere/*.shp"), ("/nowhere/*.shp", "the pattern")),
         (("small", "--crs", CRS, "--out", "OUT"), ("not both",)),
         (("--crs", CRS, "--out", "OUT", "--scheduler", "dask"), ("dask", "tcp://")),
         (
@@ -464,3 +466,18 @@ def test_options_of_files_are_refused_beside_a_region(
     assert said.status == 2
     assert option[0] in said.error
     assert "--footprints" in said.error
+
+
+def test_a_pattern_of_footprints_names_the_files_that_it_fits(tmp_path: Path) -> None:
+    for name in ("east.gpkg", "west.gpkg", "west.dbf", "old[1].gpkg"):
+        (tmp_path / name).touch()
+
+    def found(*patterns: str) -> list[str]:
+        spec = maps_of_files(tmp_path / "out", [tmp_path / p for p in patterns], crs=CRS)
+        assert spec.footprints is not None
+        return [Path(p).name for p in spec.footprints.paths]
+
+    assert found("*st.*") == ["east.gpkg", "west.gpkg"]
+    assert found("east.gpkg", "*.gpkg") == ["east.gpkg", "old[[]1].gpkg", "west.gpkg"]
+    # A file that is called like a pattern is that file.
+    assert found("old[1].gpkg") == ["old[[]1].gpkg"]
