@@ -201,6 +201,10 @@ def test_faults_are_one_line_and_named(tmp_path: Path) -> None:
     assert "tells no height" in refused(tmp_path / "k", images)
     assert "(--fov FLOAT)" in refused(tmp_path / "l", images, "--agl", 60)
     assert good(tmp_path / "m", images, "--agl", 60, "--fov", 43).frames[3].agl_m == 60.0
+    code, told = command("import", images, "--out", tmp_path / "o", "--agl", 60, "--camera", "50,51,30,20")
+    assert code == 0, told
+    assert ", fx 50.0, fy 51.0, cx 30.0, cy 20.0 (" in told
+    assert "as given; mount roll 0, pitch 0, yaw 0" in told
 
 
 def test_options_that_a_log_has_no_use_for_are_told(tmp_path: Path) -> None:

@@ -53,13 +53,20 @@ def imported(path: Path, log: Log, pictures: Pictures | None, settings: ImportSe
     if pictures is not None:
         flown, chosen = _frames(path, log, height, pictures, settings, says)
         mount = (0.0, 0.0, 0.0) if is_of_camera(log) else settings.mount_deg
-        video = pictures.video
-        camera = _camera(path, log, pictures, settings)
-        if settings.camera is not None:
-            named = zip(("fx", "fy", "cx", "cy"), (camera.fx, camera.fy, camera.cx, camera.cy))
-            bent = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion)
-            numbers = ", ".join(f"{name} {value:g}" for name, value in (*named, *bent))
-            says.append(f"camera: {camera.width} x {camera.height}, {numbers}")
+        video, camera = pictures.video, _camera(path, log, pictures, settings)
+        given = settings.fov_deg is not None or settings.camera is not None
+        named = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion)
+        bent = "".join(f", {name} {value:g}" for name, value in named) if any(camera.distortion) else ""
+        says.append(
+            f"camera: {camera.width} x {camera.height}, fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy "
+            f"{camera.cy:.1f} ({2.0 * math.degrees(math.atan(camera.half_fov_tan)):.1f} degrees across the short side){bent}, "
+            f"{'as given' if given else 'from the log' if log.camera is not None else 'from the pictures'}; mount "
+            + (
+                "of a stabilised camera"
+                if is_of_camera(log)
+                else "roll {:g}, pitch {:g}, yaw {:g}".format(*mount)
+            )
+        )
         parts = replace(
             parts,
             camera=camera,

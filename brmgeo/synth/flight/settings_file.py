@@ -15,7 +15,6 @@ from brmgeo.settings import Toml, build, read_toml
 from brmgeo.synth.flight.settings import SimulationSettings
 
 _Pixels = Annotated[int, Field(ge=8, le=30000)]
-_MOUNTS = ("mount", "told_mount")
 _Focal = Annotated[float, Field(ge=1.0)]
 
 
@@ -30,18 +29,21 @@ def read_simulation_settings(path: Path, base: SimulationSettings) -> Simulation
     (with the nearest one) and a value of another type or out of range.
     """
     toml = read_toml(path)
-    plain = {key: value for key, value in toml.data.items() if key not in ("camera", *_MOUNTS)}
+    plain = {key: value for key, value in toml.data.items() if key not in ("camera", "mount", "told_mount")}
     made = build(replace(toml, data=plain), SimulationSettings, base)
     if "camera" in toml.data:
         made = replace(made, camera=_camera(toml, base.camera))
-    for key in _MOUNTS:
-        if key in toml.data:
-            before = getattr(base, key) or made.mount
-            own = (math.degrees(v) for v in (before.roll_rad, before.pitch_rad, before.yaw_rad))
-            turns = build(toml, _MountKeys, _MountKeys(*own), at=(key,))
-            angles = (turns.roll_deg, turns.pitch_deg, turns.yaw_deg)
-            made = replace(made, **{key: Attitude(*(math.radians(v) for v in angles))})
+    if "mount" in toml.data:
+        made = replace(made, mount=_mount(toml, "mount", made.mount))
+    if "told_mount" in toml.data:
+        made = replace(made, told_mount=_mount(toml, "told_mount", made.known_mount))
     return made
+
+
+def _mount(toml: Toml, key: str, before: Attitude) -> Attitude:
+    own = (math.degrees(v) for v in (before.roll_rad, before.pitch_rad, before.yaw_rad))
+    turns = build(toml, _MountKeys, _MountKeys(*own), at=(key,))
+    return Attitude(*(math.radians(v) for v in (turns.roll_deg, turns.pitch_deg, turns.yaw_deg)))
 
 
 @dataclass(frozen=True, slots=True)
