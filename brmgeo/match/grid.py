@@ -264,23 +264,30 @@ class GridMatcher:
         turn = body if body is not None else 0.0
         pose = np.array([*track.mean[:2], track.mean[2] + turn])
         pose_cov = track.covariance[:3, :3].copy()
+        if np.trace(cov) < np.trace(pose_cov[:2, :2]):
+            # After a step as wide as this the belief, which has seen the view, knows the place better than the track.
+            pose[:2] = mean
+            pose_cov[:2, :2] = cov
+            pose_cov[:2, 2] = pose_cov[2, :2] = 0.0
+        place, place_cov = pose[:2].copy(), pose_cov[:2, :2].copy()
         if body is None and motion.step_m is not None:
             if motion.compass_yaw_rad is None:
-                return track.mean[:2].copy(), track.covariance[:2, :2].copy(), heading, heading_sigma
+                return place, place_cov, heading, heading_sigma
             pose[2] = motion.compass_yaw_rad
             pose_cov[2, :] = pose_cov[:, 2] = 0.0
             pose_cov[2, 2] = odo.compass_sigma_rad**2
         anchor = self.scorer.measure(view, pose, pose_cov)
         if anchor is not None and body is None and motion.step_m is not None:
             # The body's yaw says nothing of the odometry frame's heading.
-            place = anchor.covariance.copy()
-            place[2, :] = place[:, 2] = 0.0
-            place[2, 2] = math.pi**2
-            anchor = Anchor(np.array([*anchor.pose[:2], track.mean[2]]), place, anchor.fit)
+            of_place = anchor.covariance.copy()
+            of_place[2, :] = of_place[:, 2] = 0.0
+            of_place[2, 2] = math.pi**2
+            anchor = Anchor(np.array([*anchor.pose[:2], track.mean[2]]), of_place, anchor.fit)
         if anchor is not None:
             d2 = track.distance2(anchor.pose, anchor.covariance, turn)
             if d2 < 16.3 or fresh:
                 track.update(anchor.pose, anchor.covariance, turn)
+                place, place_cov = track.mean[:2].copy(), track.covariance[:2, :2].copy()
                 self._misses = 0
                 self._confirmed |= self._fits_well(anchor.fit)
                 if self._confirmed:
@@ -292,15 +299,9 @@ class GridMatcher:
                 if self._misses >= 3:
                     self.track, self._confirmed = None, False
                     self._misses = 0
-        result = (
-            track.mean[:2].copy(),
-            track.covariance[:2, :2].copy(),
-            float(track.mean[2]),
-            math.sqrt(float(track.covariance[2, 2])),
-        )
         if motion.step_m is None and body is None:
             self.track = None
-        return result
+        return place, place_cov, float(track.mean[2]), math.sqrt(float(track.covariance[2, 2]))
 
     def _fits_well(self, fit: float) -> bool:
         # A view of next to no building has no fit, good or bad.
