@@ -59,7 +59,8 @@ def imported(path: Path, log: Log, pictures: Pictures | None, settings: ImportSe
         bent = "".join(f", {name} {value:g}" for name, value in named) if any(camera.distortion) else ""
         says.append(
             f"camera: {camera.width} x {camera.height}, fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy "
-            f"{camera.cy:.1f} ({2.0 * math.degrees(math.atan(camera.half_fov_tan)):.1f} degrees across the short side){bent}, "
+            f"{camera.cy:.1f}{bent} ({2.0 * math.degrees(math.atan(camera.half_fov_tan)):.1f} degrees across the short "
+            "side), "
             f"{'as given' if given else 'from the log' if log.camera is not None else 'from the pictures'}; mount "
             + (
                 "of a stabilised camera"
