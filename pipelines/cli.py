@@ -609,8 +609,9 @@ def simulate(
 @click.option(
     "--tilt-sigma",
     "tilt_sigma_deg",
-    type=click.FloatRange(0, 11.4),
-    help="Standard deviation of roll and pitch, mount included, degrees (default 0.2).",
+    type=click.FloatRange(0, 11),
+    help="Standard deviation of the camera mount's roll and pitch, degrees (default: what the flight says); from 1 on the "
+    "mount is looked for.",
 )
 @click.option(
     "--odometry",
@@ -1020,7 +1021,6 @@ def export_onnx(weights: Path | None, out: Path, tile_px: int, any_size: bool) -
     "--mount",
     "mount_deg",
     type=_Numbers(3),
-    default=(0.0, 0.0, 0.0),
     help="Camera in the body: roll,pitch,yaw degrees.",
 )
 @click.option(
@@ -1062,7 +1062,7 @@ def import_(
     camera: str | None,
     agl_m: float | None,
     ground_m: float | None,
-    mount_deg: tuple[float, ...],
+    mount_deg: tuple[float, ...] | None,
     body_deg: tuple[float, ...],
     axes: Literal["flu", "frd", "optical", "nadir"] | None,
     imu_units: str | None,

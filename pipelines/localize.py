@@ -10,13 +10,14 @@ import numpy as np
 
 from brmgeo.errors import FlightError, InputError, MissingInputError, SettingsError
 from brmgeo.files import require_replaceable, whole_folder
-from brmgeo.flight.checks import mirrored_m
+from brmgeo.flight.checks import doubtful_axes, mirrored_m
 from brmgeo.flight.folder import Flight
 from brmgeo.flight.own import own_odometry
-from brmgeo.flight.readings import Reference
+from brmgeo.flight.readings import Attitude, Reference
 from brmgeo.geo.crs import apart
 from brmgeo.geo.grid import as_bounds
 from brmgeo.locate.flights import locate_flight
+from brmgeo.locate.localizer import MIN_MOUNT_SIGMA_RAD
 from brmgeo.locate.maps import match_settings, read_maps
 from brmgeo.locate.masks import NetworkUse, frame_masks
 from brmgeo.match import METHODS, MatchSettings
@@ -35,7 +36,7 @@ class Sensors:
     Attributes:
         step_m, step_share: of an odometry step per axis: metres, and as a share of its length.
         compass_deg: of the compass.
-        tilt_deg: of roll and pitch.
+        tilt_deg: of the mount's roll and pitch, in place of what the flight says.
     """
 
     step_m: float | None = None
@@ -49,7 +50,6 @@ class Sensors:
             "step_sigma_m": self.step_m,
             "step_sigma_share": self.step_share,
             "compass_sigma_rad": None if self.compass_deg is None else math.radians(self.compass_deg),
-            "attitude_sigma_rad": None if self.tilt_deg is None else math.radians(self.tilt_deg),
         }
         given = {name: value for name, value in known.items() if value is not None}
         return replace(base, odometry=replace(base.odometry, **given)) if given else base
@@ -72,7 +72,8 @@ def localize(
 ) -> Path:
     """Locates a flight over built maps and writes all its results into ``out``; returns the report's path.
 
-    A flight without odometry gets its own from its frames, where they are dense enough, unless ``odometry`` is "given".
+    A mount that is unknown is found first, and the flight located with it. A flight without odometry gets its own from its
+    frames, where they are dense enough, unless ``odometry`` is "given".
     ``out`` is replaced as a whole, at the end: a run that fails leaves what was there. ``max_speed_m_s`` bounds the
     movement where odometry says nothing (default: the region's); ``sensors`` says what the sensors are worth. ``network``
     says where masks come from (default: the flight's own where it has some, else the network that ships with brmgeo).
@@ -94,7 +95,7 @@ def localize(
             f"{flight.folder / 'frames'}: the flight has masks only, and SIFT needs frames: do without it",
             needs="sift",
         )
-    own = flight_settings or FlightSettings()
+    as_given, own = flight, flight_settings or FlightSettings()
     if max_speed_m_s is not None:
         own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
     settings = (sensors or Sensors()).settings(match_settings(own))
@@ -103,6 +104,8 @@ def localize(
         flight = tried.flight
         if tried.says:
             progress.say(f"{flight.name} odometry: {tried.says}")
+    if flight.odometry is not None and not flight.axes_told and (says := doubtful_axes(flight.odometry)):
+        raise FlightError(f"{flight.folder}: {flight.odometry.source}: {says} (in [odometry] of flight.toml)")
     reference = flight.reference(maps.crs)
     if reference is not None:
         there = as_bounds((*np.nanmin(reference.xy_m, axis=0), *np.nanmax(reference.xy_m, axis=0)))
@@ -118,13 +121,38 @@ def localize(
             "without",
             needs="compass",
         )
+    tilt_deg = None if sensors is None else sensors.tilt_deg
+    mount_sigma_rad = flight.mount_sigma_rad if tilt_deg is None else math.radians(tilt_deg)
     given, use = f"{source_of(flight)}: masks/ of the flight folder", network or NetworkUse()
     with frame_masks(flight, given, use, progress, maps.folder.name) as masks:
         with progress.stage(f"{flight.name} {method}") as bar:
             located = locate_flight(
                 maps, flight, masks, method=method, settings=settings, compass_yaw_rad=yaws,
-                each=bar.watch(serial_map),
+                mount_sigma_rad=mount_sigma_rad, each=bar.watch(serial_map),
             )  # fmt: skip
+        if located.found_mount is not None:
+            # Odometry of the frames, and masks, were made with the other mount: all of it again with the one that was found.
+            progress.say(_mount_line(flight, *located.found_mount))
+            mount, sigma_rad = located.found_mount
+            return localize(
+                maps_dir,
+                replace(as_given, mount=mount, mount_sigma_rad=min(sigma_rad, 0.999 * MIN_MOUNT_SIGMA_RAD)),
+                method,
+                out,
+                flight_settings=flight_settings,
+                compass=compass,
+                sift=sift,
+                max_speed_m_s=max_speed_m_s,
+                sensors=None if sensors is None else replace(sensors, tilt_deg=None),
+                network=network,
+                odometry=odometry,
+                attribution=attribution,
+            )
+        if method == "mask" and mount_sigma_rad >= MIN_MOUNT_SIGMA_RAD:
+            progress.say(
+                f"{flight.name}: the camera's mount, known to {math.degrees(mount_sigma_rad):g} degrees, was not found: "
+                "fixes are no surer than it is"
+            )
         results = FlightResults(
             maps=maps,
             masks=masks,
@@ -166,3 +194,12 @@ def _require_unmirrored(flight: Flight, reference: Reference) -> None:
             f"shift, and {mirrored:.1f} m when mirrored; its z axis points down: say so with axes in [odometry] of "
             "flight.toml (nadir for a camera that looks down, else frd), or import it again with them"
         )
+
+
+def _mount_line(flight: Flight, mount: Attitude, sigma_rad: float) -> str:
+    roll, pitch, yaw = (math.degrees(v) for v in (mount.roll_rad, mount.pitch_rad, mount.yaw_rad))
+    return (
+        f"{flight.name}: the camera seems to look {abs(pitch):.1f} +- {math.degrees(sigma_rad):.1f} degrees "
+        f"{'ahead' if pitch < 0 else 'behind'}: mount roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f}; give it as [mount] "
+        "in flight.toml"
+    )

@@ -71,8 +71,8 @@ def _left_out(log: Log, settings: ImportSettings, blind: bool) -> list[str]:
     bag, text = log.kind == "rosbag", log.kind not in ("rosbag", "ulog", "ardupilot", "mavlink", "photos")
     gimbal = "the photos tell the camera's own attitude (gimbal), so it has none"
     unused = (
-        ("--mount", is_of_camera(log) and any(settings.mount_deg), gimbal),
-        ("--mount", blind and any(settings.mount_deg), "there are no pictures"),
+        ("--mount", is_of_camera(log) and settings.mount_deg is not None, gimbal),
+        ("--mount", blind and settings.mount_deg is not None, "there are no pictures"),
         ("--shift-frames", blind and settings.shift_frames_s, "there are no pictures"),
         ("--shift-frames", video and settings.shift_frames_s, "with --video, --video-start says when its frames were taken"),
         ("--video-start", not video and settings.video_start_s, "there is no --video"),

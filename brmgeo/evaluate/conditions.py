@@ -21,6 +21,7 @@ _LEG_M = (150.0, 300.0)
 _LEG_SIGMA_M = (2.0, 20.0)
 _TILT_DEG = (10.0, 18.0)
 _NEAR_DEG = 5.0
+_UNKNOWN_DEG = 10.0
 _RECALL = (0.4, 0.6)
 #: Streams of randomness, so that one condition leaves the others as they are.
 _LEGS, _TILT, _MASKS, _MAP = range(201, 205)
@@ -45,6 +46,11 @@ class Condition:
     tilt: Literal["unknown", "near"] | None = None
     poor_masks: bool = False
     gone: float = 0.0
+
+    @property
+    def tilt_sigma_rad(self) -> float:
+        """How well the told mount is known."""
+        return math.radians({None: 0.0, "near": _NEAR_DEG, "unknown": _UNKNOWN_DEG}[self.tilt])
 
     def settings(self, base: SimulationSettings, seed: int) -> SimulationSettings:
         """The simulator's settings under this condition."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,11 +18,12 @@ from brmgeo.evaluate.scores import score
 from brmgeo.evaluate.sift import sift_fixes
 from brmgeo.evaluate.table import FlightRow
 from brmgeo.flight.camera import slant_gsd_m
-from brmgeo.flight.readings import FloatArray
-from brmgeo.flight.values import Estimate, View
+from brmgeo.flight.readings import Attitude, FloatArray
+from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
 from brmgeo.geo.grid import Bounds
-from brmgeo.locate.flights import locate
+from brmgeo.locate.flights import Located, locate
+from brmgeo.locate.localizer import Localizer
 from brmgeo.locate.maps import Maps, match_settings, read_maps
 from brmgeo.locate.masks import ROOF_M, above_roofs_m, network_mask
 from brmgeo.match import GroundMap
@@ -154,7 +155,12 @@ def fly_trial(trial: Trial) -> list[FlightRow]:
     rows = []
     for method in trial.methods:
         for kind, views in seen.items():
-            located = locate(known, views, flown.motions, method, match_settings(trial.own))
+            if condition is not None and condition.tilt is not None:
+                located = scene.located(
+                    replace(maps, ground=known), flown.motions, method, condition.tilt_sigma_rad
+                )
+            else:
+                located = locate(known, views, flown.motions, method, match_settings(trial.own))
             rows.append(
                 FlightRow(
                     flight=flight,
@@ -187,6 +193,28 @@ class _TrialFlight:
     def course(self) -> Course:
         """The course, the same for all kinds of masks."""
         return fly(self.route, self.settings, self.trial.seed)
+
+    def located(self, maps: Maps, steps: Sequence[Motion], method: str, sigma_rad: float) -> Located:
+        """The flight by a localizer that knows the told mount to ``sigma_rad``, and looks for it."""
+        own = self.trial.own
+        here = Localizer(
+            maps,
+            self.settings.camera,
+            self.settings.known_mount,
+            method=method,
+            settings=match_settings(own),
+            history=True,
+            mount_sigma_rad=sigma_rad,
+        )
+        simulator = self._simulator(self.settings)
+        estimates, seconds = [], []
+        for i, motion in enumerate(steps):
+            mask = simulator.mask(i, relief=False)
+            attitude, agl_m = Attitude(*self._attitude_rad(i)), float(self.course.measured_agl_m[i])
+            estimates.append(here.take(float(self.course.frame_times_s[i]), mask, attitude, agl_m, motion))
+            assert here.last is not None
+            seconds.append(here.last.seconds)
+        return Located(estimates, here.smooth(), np.array(seconds), list(steps), here.found_mount)
 
     def views(self, kind: str, masks: MaskComparison, simulated: list[View]) -> list[View]:
         """The flight's views by one kind of mask: the same course, the same readings, only the masks differ."""

@@ -16,10 +16,10 @@ from brmgeo.flight.readings import FloatArray, Imu, Odometry
 
 #: Correlation of two turn rates from which their lag is believed.
 MIN_CORRELATION = 0.6
-#: Text formats that do not say how the axes of their tracks lie.
-AXES_UNTOLD = ("tum", "euroc", "vins-mono", "vins-fusion")
 #: Correlation of leaning and acceleration from which up and down are told apart.
 MIN_LEANING = 0.3
+#: Fewer poses than this are not looked at for their axes.
+MIN_POSES = 50
 #: Mean share of the way along one axis of the body that counts as flying along it.
 MIN_ALONG = 0.7
 #: Rest lies within these of standard gravity; a handheld or flying one too, in the median.
@@ -176,12 +176,12 @@ def leaning(odometry: Odometry) -> float | None:
     """Correlation of a track's horizontal acceleration with the way that its z axis leans, in [-1, 1].
 
     What flies by thrust or lift leans to where it accelerates: well above 0 where z points up, well below where it points
-    down, so that the track is mirrored. The track's scale does not matter. None for less than 20 s, or where nothing leans
-    or turns (a straight course, a stabilised camera).
+    down, so that the track is mirrored. The track's scale does not matter. None for less than 20 s or four poses a second,
+    or where nothing leans or turns (a straight course, a stabilised camera).
     """
     step, smooth, slow = 0.1, 5.0, 20.0
     at = np.arange(odometry.t_s[0], min(odometry.t_s[-1], odometry.t_s[0] + 3600.0), step)
-    if len(at) < 200:
+    if len(at) < 200 or np.median(np.diff(odometry.t_s)) > 0.25:
         return None
 
     def quick(values: FloatArray) -> FloatArray:
@@ -222,8 +222,8 @@ def doubtful_axes(odometry: Odometry) -> str:
     A monocular SLAM's track begins as the world of its first camera. Of one that looks down the z axis points down all the
     way, and nothing but leaning, and the axis that it flies along, tells it from a body whose z axis points up.
     """
-    lean = leaning(odometry)
-    if lean is not None and lean > MIN_LEANING:
+    lean = leaning(odometry) if len(odometry.t_s) >= MIN_POSES else None
+    if len(odometry.t_s) < MIN_POSES or (lean is not None and lean > MIN_LEANING):
         return ""
     x, y = along_body(odometry).tolist()
     camera = abs(y) > MIN_ALONG

@@ -22,9 +22,9 @@ from brmgeo.codes import LABEL_BUILDING, LABEL_OTHER
 from brmgeo.errors import BrmgeoError, CrsError, FlightError, InputError, listed
 from brmgeo.files import digest, json_of, read_json
 from brmgeo.flight.camera import border_pixels, ray_from_pixel
-from brmgeo.flight.checks import AXES_UNTOLD, doubtful_axes
 from brmgeo.flight.frames import Axes
 from brmgeo.flight.odometry import OdometryOptions, read_odometry
+from brmgeo.flight.poses import AXES_UNTOLD
 from brmgeo.flight.readings import Attitude, Camera, FloatArray, Frame, Imu, Odometry, Reference
 from brmgeo.flight.tables import Table, read_table, read_times, refuse
 from brmgeo.flight.video import Video
@@ -42,11 +42,12 @@ MADE_BY = "brmgeo odometry"
 #: What the first line of a simulated flight's flight.toml said before there was a key for it.
 _OLD_NOTE = "# Simulated by brmgeo"
 
+_MOUNT = ("roll_deg", "pitch_deg", "yaw_deg")
 _TOP: dict[str, type] = {"name": str, "simulated": bool}
 _KEYS: dict[str, dict[str, type]] = {
     "camera": {"width": int, "height": int, "distortion": list}
     | dict.fromkeys(("fov_deg", "fx", "fy", "cx", "cy"), float),
-    "mount": {"roll_deg": float, "pitch_deg": float, "yaw_deg": float},
+    "mount": dict.fromkeys((*_MOUNT, "sigma_deg"), float),
     "frames": {"video": str, "start_s": float},
     "odometry": dict.fromkeys(("file", "format", "quaternion", "axes", "topic", "times", "covariance"), str),
     "height": {"source": str, "fixed_m": float},
@@ -72,6 +73,8 @@ class Flight:
         has_images: the frames' pictures are there (a masks-only flight has none).
         simulated: nobody flew it: flight.toml says so, in its key or, in older folders, in its first comment. A comment
             is no leave to replace the folder: see ``may_be_remade``.
+        axes_told: how the axes of the odometry lie is told, by its format or by flight.toml.
+        mount_sigma_rad: how well the mount's roll and pitch are known, standard deviation, radians.
     """
 
     folder: Path
@@ -83,6 +86,8 @@ class Flight:
     has_masks: bool
     has_images: bool
     simulated: bool = False
+    axes_told: bool = True
+    mount_sigma_rad: float = 0.0
     _video: Video | None = None
     _video_start_s: float = 0.0
     _reference: tuple[Path, str | None] | None = None
@@ -241,7 +246,7 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
     folder = Path(folder)
     toml = _FlightToml(folder / "flight.toml")
     camera = _camera(toml)
-    mount = Attitude(*(math.radians(toml.number("mount", k, 0.0, -360, 360)) for k in _KEYS["mount"]))
+    mount = Attitude(*(math.radians(toml.number("mount", k, 0.0, -360, 360)) for k in _MOUNT))
 
     table = read_table(
         folder / "frames.csv", [("t_s", "file")], ["agl_m", "roll_deg", "pitch_deg", "yaw_deg"], ["file"]
@@ -270,7 +275,8 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
     )
 
     simulated = bool(toml.data.get("simulated", "\n".join(toml.lines).startswith(_OLD_NOTE)))
-    odometry = _odometry(toml, folder, mount, frames, times, simulated) if with_odometry else None
+    odometry = _odometry(toml, folder, mount, frames, times) if with_odometry else None
+    told = toml.section("odometry") if "odometry" in toml.data else {}
     reference = _reference(toml, folder)
     return Flight(
         folder,
@@ -282,6 +288,11 @@ def read_flight(folder: Path | str, *, with_odometry: bool = True) -> Flight:
         has_masks,
         has_images,
         simulated=simulated,
+        axes_told=simulated
+        or "axes" in told
+        or told.get("format") not in AXES_UNTOLD
+        or is_own_odometry(folder),
+        mount_sigma_rad=math.radians(toml.number("mount", "sigma_deg", 0.0, 0.0, 11.0)),
         _video=video,
         _video_start_s=toml.number("frames", "start_s", 0.0),
         _reference=reference,
@@ -585,7 +596,6 @@ def _odometry(
     mount: Attitude,
     frames: tuple[Frame, ...],
     times: FloatArray,
-    simulated: bool,
 ) -> Odometry | None:
     if "odometry" not in toml.data:
         stray = sorted(folder.glob("odometry.*"))
@@ -632,10 +642,6 @@ def _odometry(
             f"{path}: the orientations tilt the body by {tilt:.0f} degrees (median), so they are not those of an upright "
             "body (x nose, y left, z up) in a frame with z up: check quaternion (xyzw or wxyz) in [odometry], or turn them"
         )
-    if axes is None and format_name in AXES_UNTOLD and not simulated:
-        says = doubtful_axes(odometry)
-        if says:
-            raise FlightError(f"{path}: {says} (in [odometry] of flight.toml)")
     return odometry
 
 

@@ -19,6 +19,8 @@ from brmgeo.flight.tables import check_increasing, number, read_rows, read_table
 UNIT_TOLERANCE = 0.01
 #: Rows that repeat a time are one pose told again when they lie no farther apart than this.
 REPEAT_M = 0.5
+#: Formats that do not say how the axes of their tracks lie.
+AXES_UNTOLD = ("tum", "euroc", "vins-mono", "vins-fusion")
 #: A whole number as logs write it: isdigit takes "²" too, and int() refuses thousands of digits.
 WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
 

@@ -52,6 +52,7 @@ class FlightParts:
         name: of the flight.
         simulated: nobody flew it, and it may be made again.
         camera, mount: the camera and how it sits in the body.
+        mount_sigma_rad: how well its roll and pitch are known, standard deviation, radians.
         frames: in order of time. Without them, and a camera, the folder is no flight yet.
         video: the file whose pictures are the frames, and the time of its first picture in seconds.
         odometry: the track; with ``walk_m2``, what it is worth is written beside it.
@@ -64,6 +65,7 @@ class FlightParts:
     simulated: bool = False
     camera: Camera | None = None
     mount: Attitude = field(default_factory=Attitude)
+    mount_sigma_rad: float = 0.0
     frames: tuple[Frame, ...] | None = None
     video: tuple[str, float] | None = None
     odometry: Odometry | None = None
@@ -84,11 +86,13 @@ def write_flight(folder: Path, parts: FlightParts) -> None:
     if parts.simulated:
         lines.append("simulated = true  # by brmgeo: no real flight")
     if parts.camera is not None:
-        lines += [*_camera_lines(parts.camera), *_mount_lines(parts.mount)]
+        lines += [*_camera_lines(parts.camera), *_mount_lines(parts.mount, parts.mount_sigma_rad)]
     if parts.video is not None:
         lines += ["[frames]", f"video = {_quoted(parts.video[0])}", f"start_s = {float(parts.video[1])!r}"]
     if parts.odometry is not None:
         section = write_track(folder, parts.odometry, track_format=parts.odometry_format)
+        if parts.odometry_format == "tum" and not parts.simulated:
+            section |= {"axes": "flu"}
         lines += _section("odometry", section)
     if parts.frames is not None:
         _write_frames(folder / "frames.csv", parts.frames)
@@ -382,7 +386,8 @@ def _camera_lines(camera: Camera) -> list[str]:
     return lines
 
 
-def _mount_lines(mount: Attitude) -> list[str]:
+def _mount_lines(mount: Attitude, sigma_rad: float) -> list[str]:
     degrees = _degrees([mount.roll_rad, mount.pitch_rad, mount.yaw_rad])
     keys = ("roll_deg", "pitch_deg", "yaw_deg")
-    return ["[mount]", *(f"{key} = {float(value)!r}" for key, value in zip(keys, degrees))]
+    lines = ["[mount]", *(f"{key} = {float(value)!r}" for key, value in zip(keys, degrees))]
+    return lines + ([f"sigma_deg = {float(_degrees([sigma_rad])[0])!r}"] if sigma_rad else [])

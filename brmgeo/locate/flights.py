@@ -18,6 +18,7 @@ from brmgeo.flight.view import make_view
 from brmgeo.locate.localizer import Localizer, usual_reset_speed_m_s
 from brmgeo.locate.maps import Maps
 from brmgeo.locate.masks import FrameMasks
+from brmgeo.locate.mount import FoundMount
 from brmgeo.match import GroundMap, MatchSettings, SmoothedPath, make_matcher
 
 FloatArray = NDArray[np.float64]
@@ -32,12 +33,14 @@ class Located:
         smoothed: the path by the whole flight.
         seconds: (n,) what each step took the matcher.
         motions: from the frame before to each frame.
+        found_mount: the camera's mount, where it was unknown and was found.
     """
 
     estimates: list[Estimate]
     smoothed: SmoothedPath
     seconds: FloatArray
     motions: list[Motion]
+    found_mount: FoundMount | None = None
 
 
 def locate(
@@ -82,6 +85,7 @@ def locate_flight(
     method: str = "mask",
     settings: MatchSettings | None = None,
     compass_yaw_rad: Sequence[float | None] | None = None,
+    mount_sigma_rad: float = 0.0,
     each: Callable[[Callable[[int], Estimate], Sequence[int]], Iterable[Estimate]] = map,
 ) -> Located:
     """Takes a whole flight through a ``Localizer``, frame by frame as it would be live, and smooths at the end.
@@ -92,6 +96,7 @@ def locate_flight(
         masks: of its frames.
         method, settings: as in ``Localizer``.
         compass_yaw_rad: (n,) yaw of the nose in the map frame from a trusted compass, or None.
+        mount_sigma_rad: as in ``Localizer``.
         each: calls a function with each number, in order, and gives the results, as ``map`` does.
     """
     settings = settings or MatchSettings()
@@ -105,6 +110,7 @@ def locate_flight(
         # The track's own poses, far closer together than frames, tell where it was reset.
         reset_speed_m_s=math.inf,
         history=True,
+        mount_sigma_rad=mount_sigma_rad,
     )
     poses = poses_at(flight.odometry, flight.times_s, max_speed_m_s=usual_reset_speed_m_s(settings))
     motions: list[Motion] = []
@@ -127,4 +133,4 @@ def locate_flight(
         return estimate
 
     estimates = list(each(step, range(len(flight.frames))))
-    return Located(estimates, here.smooth(), np.array(seconds), motions)
+    return Located(estimates, here.smooth(), np.array(seconds), motions, here.found_mount)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,11 +24,17 @@ from brmgeo.flight.values import Estimate, Motion, View
 from brmgeo.flight.view import make_view
 from brmgeo.locate.maps import Maps
 from brmgeo.locate.masks import ROOF_M, above_roofs_m, known_by, network_image, stored_of
+from brmgeo.locate.mount import FoundMount, MountFinder
 from brmgeo.locate.saved import differs, read_saved, settings_of, write_saved
-from brmgeo.match import MatchSettings, SmoothedPath, make_matcher
-from brmgeo.match.state import under, within
+from brmgeo.match import Matcher, MatchSettings, SmoothedPath, make_matcher
+from brmgeo.match.history import History, motion_of
+from brmgeo.match.state import State, under, within
 from brmgeo.segment.predict import Answer, Segmenter, picture_of
 
+#: From this on a mount's roll and pitch count as unknown, and are looked for; and the most that may be unknown.
+MIN_MOUNT_SIGMA_RAD, MAX_MOUNT_SIGMA_RAD = math.radians(1.0), math.radians(11.0)
+#: Frames that wait for the mount, where no history keeps all of them.
+_MOST_WAITING = 60
 #: Of the saved file. Raised by hand when what it holds changes.
 _FORMAT = 1
 
@@ -56,6 +62,18 @@ class _Ways:
     roof_m: float | None
     reset_speed_m_s: float
     history: bool
+    mount_sigma_rad: float = 0.0
+
+
+class _Frame(NamedTuple):
+    """A frame that waits for its mount to be found: what is seen, and what it was taken with."""
+
+    t_s: float
+    image: NDArray[Any]
+    attitude: Attitude
+    agl_m: float
+    motion: Motion
+    file: str
 
 
 class Localizer:
@@ -74,6 +92,9 @@ class Localizer:
         reset_speed_m_s: odometry that moved faster than this since the frame before was reset. None: 60, or the settings'
             greatest speed where that is higher. ``math.inf`` where the poses' segments tell every reset.
         history: keep every view, so that ``smooth`` can be asked; without it, memory does not grow with the flight.
+        mount_sigma_rad: standard deviation of the mount's roll and of its pitch. From ``MIN_MOUNT_SIGMA_RAD`` on they count
+            as unknown: no place is surer than they are, until frames enough agree on them (``found_mount``); then the
+            flight so far is matched anew.
 
     Raises SettingsError for another method or a value out of range.
     """
@@ -91,6 +112,7 @@ class Localizer:
         roof_m: float | None = None,
         reset_speed_m_s: float | None = None,
         history: bool = False,
+        mount_sigma_rad: float = 0.0,
     ) -> None:
         settings = settings or MatchSettings()
         if reset_speed_m_s is None:
@@ -103,9 +125,19 @@ class Localizer:
             raise SettingsError(
                 f"reset speed {reset_speed_m_s} m/s: give one above 0", needs="reset_speed_m_s"
             )
+        if not 0 <= mount_sigma_rad <= MAX_MOUNT_SIGMA_RAD:
+            raise SettingsError(
+                f"mount known to {math.degrees(mount_sigma_rad):g} degrees: give 0 to {math.degrees(MAX_MOUNT_SIGMA_RAD):g}",
+                needs="mount_sigma_rad",
+            )
         self.maps, self.camera, self.mount, self.masks = maps, camera, mount, masks
-        self._ways = _Ways(method, settings, answer, roof_m, reset_speed_m_s, history)
-        self._matcher = make_matcher(method, maps.ground, settings, history=history)
+        self._ways = _Ways(method, settings, answer, roof_m, reset_speed_m_s, history, mount_sigma_rad)
+        self.found_mount: FoundMount | None = None
+        self._waiting: list[_Frame] = []
+        self._finder = None
+        if method == "mask" and mount_sigma_rad >= MIN_MOUNT_SIGMA_RAD:
+            self._finder = MountFinder(maps.ground, settings, camera, mount, mount_sigma_rad)
+        self._matcher = self._fresh(mount_sigma_rad)
         self._motions = MotionSource(max_speed_m_s=reset_speed_m_s)
         self._t_s = -math.inf
         self._last: LastStep | None = None
@@ -150,18 +182,73 @@ class Localizer:
             raise InputError(
                 f"a frame at {t_s} s: its pose or compass is no number: hand in None for unknown"
             )
-        view = self.view(t_s, picture, attitude, agl_m, file=file)
+        image, above_m = self._seen(t_s, picture, attitude, agl_m, file)
         motion = self._motions.motion(t_s, pose, compass_yaw_rad)
-        self._t_s = t_s
+        return self._take(_Frame(t_s, image, attitude, above_m, motion, file))
+
+    def take(
+        self, t_s: float, picture: NDArray[Any], attitude: Attitude, agl_m: float, motion: Motion
+    ) -> Estimate:
+        """As ``step``, with the motion since the frame before in place of poses."""
+        image, above_m = self._seen(t_s, picture, attitude, agl_m, "")
+        return self._take(_Frame(t_s, image, attitude, above_m, motion, ""))
+
+    def _take(self, frame: _Frame) -> Estimate:
+        self._t_s = frame.t_s
         start = time.perf_counter()
-        estimate = self._matcher.step(view, motion)
-        self._last = LastStep(view, motion, time.perf_counter() - start)
+        view = self._levelled(frame, self.mount)
+        estimate = self._matcher.step(view, frame.motion)
+        if self._finder is not None:
+            estimate = self._seek(self._finder, frame, estimate)
+        self._last = LastStep(view, frame.motion, time.perf_counter() - start)
         return estimate
+
+    def _seek(self, finder: MountFinder, frame: _Frame, estimate: Estimate) -> Estimate:
+        """The estimate, once the mount is found by this frame that of the flight so far, matched anew."""
+        self._waiting.append(frame)
+        if not self._ways.history:
+            del self._waiting[:-_MOST_WAITING]
+        if estimate.mass <= self._ways.settings.belief.converged_mass or not math.isfinite(estimate.yaw_rad):
+            return estimate
+        sigma_m = math.sqrt(float(np.trace(estimate.covariance)) / 2.0)
+        pose = np.array([*estimate.mean, estimate.yaw_rad])
+        found = finder.add(
+            lambda mount: self._levelled(frame, mount), frame.attitude, frame.agl_m, pose, sigma_m
+        )
+        if found is None:
+            return estimate
+        waiting = self._waiting
+        self._adopt(found)
+        for earlier in waiting:
+            estimate = self._matcher.step(self._levelled(earlier, self.mount), earlier.motion)
+        return estimate
+
+    def _adopt(self, found: FoundMount) -> None:
+        self.found_mount, self.mount = found, found.mount
+        self._finder, self._waiting = None, []
+        self._matcher = self._fresh(found.sigma_rad)
+
+    def _fresh(self, mount_sigma_rad: float) -> Matcher:
+        """A matcher that has seen nothing and holds views for levelled as well as the mount is known."""
+        ways, odometry = self._ways, self._ways.settings.odometry
+        settings = ways.settings
+        if mount_sigma_rad > 0:
+            sigma = math.hypot(odometry.attitude_sigma_rad, mount_sigma_rad)
+            settings = replace(settings, odometry=replace(odometry, attitude_sigma_rad=sigma))
+        return make_matcher(ways.method, self.maps.ground, settings, history=ways.history)
 
     def view(
         self, t_s: float, picture: NDArray[Any], attitude: Attitude, agl_m: float, *, file: str = ""
     ) -> View:
         """The levelled view that ``step`` makes of a frame, without taking it in."""
+        image, above_m = self._seen(t_s, picture, attitude, agl_m, file)
+        still = Motion(dt_s=0.0, step_m=None, yaw_rad=None)
+        return self._levelled(_Frame(t_s, image, attitude, above_m, still, file), self.mount)
+
+    def _seen(
+        self, t_s: float, picture: NDArray[Any], attitude: Attitude, agl_m: float, file: str
+    ) -> tuple[NDArray[Any], float]:
+        """The mask of a frame, and the height above what it shows, metres."""
         if not all(map(math.isfinite, (attitude.roll_rad, attitude.pitch_rad, agl_m))) or agl_m <= 0:
             raise InputError(
                 f"{file or 'a frame'} at {t_s} s: roll {attitude.roll_rad} rad, pitch {attitude.pitch_rad} rad and height "
@@ -178,16 +265,19 @@ class Localizer:
             image, roof_m = self._ask(picture, attitude, agl_m, file), ROOF_M
         if self._ways.roof_m is not None:
             roof_m = self._ways.roof_m
+        return image, above_roofs_m(agl_m, roof_m)
+
+    def _levelled(self, frame: _Frame, mount: Attitude) -> View:
         return make_view(
-            image,
+            frame.image,
             self.camera,
-            self.mount,
-            attitude.roll_rad,
-            attitude.pitch_rad,
-            above_roofs_m(agl_m, roof_m),
+            mount,
+            frame.attitude.roll_rad,
+            frame.attitude.pitch_rad,
+            frame.agl_m,
             self.maps.ground.gsd_m,
-            t_s=t_s,
-            file=file,
+            t_s=frame.t_s,
+            file=frame.file,
         )
 
     def smooth(self) -> SmoothedPath:
@@ -220,8 +310,12 @@ class Localizer:
             "camera": asdict(self.camera),
             "mount": asdict(self.mount),
             "ways": asdict(self._ways),
+            "found_mount": None if self.found_mount is None else self.found_mount.sigma_rad,
+            "files": [frame.file for frame in self._waiting],
         }
         arrays = within("motion", self._motions.state()) | within("matcher", self._matcher.state())
+        if self._finder is not None:
+            arrays |= within("waiting", _waiting_state(self._waiting, self._finder))
         write_saved(Path(path), header, arrays)
 
     @classmethod
@@ -245,6 +339,12 @@ class Localizer:
             for name, own in (("maps", here._maps()), ("network", _network(masks))):
                 if told := differs(header[name], own):
                     raise InputError(f"{path}: saved with {name} of {told}: give the same, or start anew")
+            if (sigma_rad := header["found_mount"]) is not None:
+                here._adopt(FoundMount(here.mount, sigma_rad))
+            elif here._finder is not None:
+                waiting = under(arrays, "waiting")
+                here._waiting = _waiting_of(waiting, header["files"])
+                here._finder.said = [tuple(row) for row in waiting["said"].tolist()]
             motion = under(arrays, "motion")
             here._motions.restore(motion)
             here._matcher.restore(under(arrays, "matcher"))
@@ -270,6 +370,30 @@ class Localizer:
                 "content": digest_of(np.ascontiguousarray(ground.building).data),
             }
         return self._maps_known_by
+
+
+def _waiting_state(waiting: list[_Frame], finder: MountFinder) -> State:
+    """Frames that wait for the mount, and what frames said of it, as named arrays."""
+    kept = History()
+    for frame in waiting:
+        kept.add(frame.t_s, frame.motion)
+    taken = [(frame.t_s, frame.attitude.roll_rad, frame.attitude.pitch_rad, frame.agl_m) for frame in waiting]
+    return {
+        "images": np.array([frame.image for frame in waiting]),
+        "taken": np.array(taken, np.float64).reshape(-1, 4),
+        "motion": kept.state()["motion"],
+        "said": np.array(finder.said, np.float64).reshape(-1, 4),
+    }
+
+
+def _waiting_of(state: State, names: list[str]) -> list[_Frame]:
+    """The frames of ``_waiting_state``."""
+    return [
+        _Frame(float(t_s), image, Attitude(float(roll), float(pitch)), float(agl_m), motion_of(row), name)
+        for image, (t_s, roll, pitch, agl_m), row, name in zip(
+            state["images"], state["taken"], state["motion"], names, strict=True
+        )
+    ]
 
 
 def _network(masks: Segmenter | None) -> dict[str, Any]:

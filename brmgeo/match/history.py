@@ -113,16 +113,7 @@ class History:
         ):
             raise damaged("the history's parts differ in length")
         self.times_s = state["t_s"].tolist()
-        self.motions = [
-            Motion(
-                dt_s=float(row[0]),
-                step_m=None if math.isnan(row[1]) else row[1:3].copy(),
-                yaw_rad=None if math.isnan(row[3]) else float(row[3]),
-                sigma_m=float(row[4]),
-                compass_yaw_rad=None if math.isnan(row[5]) else float(row[5]),
-            )
-            for row in state["motion"]
-        ]
+        self.motions = [motion_of(row) for row in state["motion"]]
         self.anchors = [
             None if math.isnan(pose[0]) else Anchor(pose, covariance, float(fit))
             for pose, covariance, fit in zip(state["pose"], state["covariance"], state["fit"])
@@ -140,6 +131,17 @@ class History:
             )
             for building, known, shape, row in zip(buildings, knowns, state["shape"], state["frame"])
         ]
+
+
+def motion_of(row: NDArray[np.float64]) -> Motion:
+    """The motion of one row of a history's state."""
+    return Motion(
+        dt_s=float(row[0]),
+        step_m=None if math.isnan(row[1]) else row[1:3].copy(),
+        yaw_rad=None if math.isnan(row[3]) else float(row[3]),
+        sigma_m=float(row[4]),
+        compass_yaw_rad=None if math.isnan(row[5]) else float(row[5]),
+    )
 
 
 def kept(history: History | None) -> History:

@@ -17,6 +17,7 @@ from brmgeo.flight.logs import kind_of, read_log
 from brmgeo.flight.logs.normal import axes_fault, faults_of, lag_s
 from brmgeo.flight.logs.values import Log, LogOptions
 from brmgeo.flight.motion import breaks
+from brmgeo.flight.poses import AXES_UNTOLD
 from brmgeo.flight.readings import FloatArray, Odometry
 from brmgeo.geo.crs import LONLAT
 
@@ -123,7 +124,7 @@ def _track_lines(track: Odometry, log: Log) -> list[str]:
             )
         elif checks.median_tilt_deg(track.wxyz) > MAX_MEDIAN_TILT_DEG:
             lines.append(f"             {axes_fault(track).says}")
-    elif log.kind in checks.AXES_UNTOLD and (says := checks.doubtful_axes(track)):
+    elif log.kind in AXES_UNTOLD and (says := checks.doubtful_axes(track)):
         lines.append(f"             {says}")
     if log.gnss is not None and log.odometry is track:
         fit = _against_gnss(log, track)

@@ -13,6 +13,7 @@ from brmgeo.errors import FlightError
 from brmgeo.flight import checks, frames
 from brmgeo.flight.folder import MAX_MEDIAN_TILT_DEG
 from brmgeo.flight.logs.values import ImportSettings, Log
+from brmgeo.flight.poses import AXES_UNTOLD
 from brmgeo.flight.readings import Imu, Odometry
 
 #: Clocks of two streams that differ by more are not of one flight recorder.
@@ -56,7 +57,7 @@ def normal(path: Path, log: Log, settings: ImportSettings | None = None) -> Log:
     ):
         fault = axes_fault(odometry)
         raise FlightError(f"{path}: {fault.says}", needs=fault.needs)
-    if odometry is not None and settings.axes is None and log.kind in checks.AXES_UNTOLD:
+    if odometry is not None and settings.axes is None and log.kind in AXES_UNTOLD:
         says = checks.doubtful_axes(odometry)
         if says:
             raise FlightError(f"{path}: {odometry.source}: {says}", needs="axes")

@@ -40,6 +40,10 @@ class Imported:
     says: tuple[str, ...]
 
 
+#: How well a camera that is said to look straight down by nothing but habit does so.
+UNTOLD_MOUNT_DEG = 10.0
+
+
 def imported(path: Path, log: Log, pictures: Pictures | None, settings: ImportSettings) -> Imported:
     """The flight of a log in the normal form and its pictures; ``path`` is for messages and the flight's name.
 
@@ -52,7 +56,9 @@ def imported(path: Path, log: Log, pictures: Pictures | None, settings: ImportSe
     chosen: dict[int, str] = {}
     if pictures is not None:
         flown, chosen = _frames(path, log, height, pictures, settings, says)
-        mount = (0.0, 0.0, 0.0) if is_of_camera(log) else settings.mount_deg
+        told = (0.0, 0.0, 0.0) if is_of_camera(log) else settings.mount_deg
+        unknown = told is None and log.attitude is None and log.odometry is None
+        mount = told or (0.0, 0.0, 0.0)
         video, camera = pictures.video, _camera(path, log, pictures, settings)
         given = settings.fov_deg is not None or settings.camera is not None
         named = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion)
@@ -67,11 +73,17 @@ def imported(path: Path, log: Log, pictures: Pictures | None, settings: ImportSe
                 if is_of_camera(log)
                 else "roll {:g}, pitch {:g}, yaw {:g}".format(*mount)
             )
+            + (
+                f", known to {UNTOLD_MOUNT_DEG:g} degrees: nothing tells how the camera looks"
+                if unknown
+                else ""
+            )
         )
         parts = replace(
             parts,
             camera=camera,
             mount=Attitude(*(math.radians(v) for v in mount)),
+            mount_sigma_rad=math.radians(UNTOLD_MOUNT_DEG) if unknown else 0.0,
             frames=flown,
             video=None if video is None else (video.name, settings.video_start_s),
         )

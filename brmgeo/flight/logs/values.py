@@ -55,7 +55,8 @@ class ImportSettings:
 
     ``photos`` and ``video`` stand in for pictures that the log does not hold; ``video_start_s`` is the log's time at
     which the video begins. ``camera`` is a camera, or fx, fy, cx, cy[, k1, k2, p1, p2[, k3]].
-    ``body_deg`` and ``mount_deg`` are roll, pitch, yaw: of the log's body in ours, and of the camera in the body.
+    ``body_deg`` and ``mount_deg`` are roll, pitch, yaw: of the log's body in ours, and of the camera in the body, None where
+    that is not told.
     ``axes`` is one of ``frames.Axes``, or None where it is to be found out that they are ours.
     ``imu_units`` are units that the log is known to be in, such as ("deg/s", "g"). ``shift_frames_s`` is added to the
     frames' times.
@@ -70,7 +71,7 @@ class ImportSettings:
     camera: Camera | tuple[float, ...] | None = None
     agl_m: float | None = None
     ground_m: float | None = None
-    mount_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    mount_deg: tuple[float, ...] | None = None
     body_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     axes: Axes | None = None
     imu_units: tuple[str, ...] = ()
