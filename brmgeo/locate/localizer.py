@@ -36,7 +36,7 @@ MIN_MOUNT_SIGMA_RAD, MAX_MOUNT_SIGMA_RAD = math.radians(1.0), math.radians(11.0)
 #: Frames that wait for the mount, where no history keeps all of them.
 _MOST_WAITING = 60
 #: Of the saved file. Raised by hand when what it holds changes.
-_FORMAT = 1
+_FORMAT = 2
 
 
 def usual_reset_speed_m_s(settings: MatchSettings) -> float:
@@ -131,6 +131,7 @@ class Localizer:
                 needs="mount_sigma_rad",
             )
         self.maps, self.camera, self.mount, self.masks = maps, camera, mount, masks
+        self._told_mount = mount
         self._ways = _Ways(method, settings, answer, roof_m, reset_speed_m_s, history, mount_sigma_rad)
         self.found_mount: FoundMount | None = None
         self._waiting: list[_Frame] = []
@@ -212,13 +213,25 @@ class Localizer:
             return estimate
         sigma_m = math.sqrt(float(np.trace(estimate.covariance)) / 2.0)
         pose = np.array([*estimate.mean, estimate.yaw_rad])
-        found = finder.add(
-            lambda mount: self._levelled(frame, mount), frame.attitude, frame.agl_m, pose, sigma_m
+        finder.add(
+            lambda mount: self._levelled(frame, mount),
+            frame.attitude,
+            frame.agl_m,
+            pose,
+            sigma_m,
+            self.mount,
         )
+        found, agreed = finder.found()
         if found is None:
             return estimate
         waiting = self._waiting
-        self._adopt(found)
+        if agreed:
+            self._adopt(found)
+        elif _apart_rad(found.mount, self.mount) > MIN_MOUNT_SIGMA_RAD:
+            # Better than what was told, but not agreed on: views are levelled by it, and no place is surer for it.
+            self.mount, self._matcher = found.mount, self._fresh(self._ways.mount_sigma_rad)
+        else:
+            return estimate
         for earlier in waiting:
             estimate = self._matcher.step(self._levelled(earlier, self.mount), earlier.motion)
         return estimate
@@ -309,6 +322,7 @@ class Localizer:
             "network": _network(self.masks),
             "camera": asdict(self.camera),
             "mount": asdict(self.mount),
+            "told_mount": asdict(self._told_mount),
             "ways": asdict(self._ways),
             "found_mount": None if self.found_mount is None else self.found_mount.sigma_rad,
             "files": [frame.file for frame in self._waiting],
@@ -335,7 +349,9 @@ class Localizer:
             camera, mount, ways = header["camera"], header["mount"], dict(header["ways"])
             settings = settings_of(ways.pop("settings"))
             camera = Camera(**{**camera, "distortion": tuple(camera["distortion"])})
-            here = cls(maps, camera, Attitude(**mount), masks=masks, settings=settings, **ways)
+            as_told = Attitude(**header["told_mount"])
+            here = cls(maps, camera, as_told, masks=masks, settings=settings, **ways)
+            here.mount = Attitude(**mount)
             for name, own in (("maps", here._maps()), ("network", _network(masks))):
                 if told := differs(header[name], own):
                     raise InputError(f"{path}: saved with {name} of {told}: give the same, or start anew")
@@ -370,6 +386,10 @@ class Localizer:
                 "content": digest_of(np.ascontiguousarray(ground.building).data),
             }
         return self._maps_known_by
+
+
+def _apart_rad(one: Attitude, other: Attitude) -> float:
+    return math.hypot(one.roll_rad - other.roll_rad, one.pitch_rad - other.pitch_rad)
 
 
 def _waiting_state(waiting: list[_Frame], finder: MountFinder) -> State:

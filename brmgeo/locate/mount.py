@@ -65,20 +65,26 @@ class MountFinder:
         agl_m: float,
         pose: FloatArray,
         sigma_m: float,
-    ) -> FoundMount | None:
-        """Takes in one frame at a known place; the mount, once frames enough agree on it.
+        mount: Attitude,
+    ) -> None:
+        """Takes in one frame at a known place.
 
         Args:
             level: the frame's levelled view under a mount.
             attitude: roll and pitch of the body.
             agl_m: height above what masks show, metres.
-            pose: x, y, yaw of the body as the view under the told mount has them.
+            pose: x, y, yaw of the body as the view under ``mount`` has them.
             sigma_m: how well x and y are known.
+            mount: where the search begins.
         """
-        best = self._fit(level, (0.0, 0.0), pose, min(3.0 * sigma_m + 6.0, 45.0), 0.12)
+        at = (
+            float(round(math.degrees(mount.roll_rad - self._told.roll_rad))),
+            float(round(math.degrees(mount.pitch_rad - self._told.pitch_rad))),
+        )
+        best = self._fit(level, at, pose, min(3.0 * sigma_m + 6.0, 45.0), 0.12)
         if best is None:
-            return self.found()
-        at, fits = (0.0, 0.0), {(0.0, 0.0): best}
+            return
+        fits = {at: best}
         for step in _STEPS_DEG:
             before = None
             while before != at:
@@ -96,21 +102,19 @@ class MountFinder:
             bends = (2 * fits[at][0] - sides[0] - sides[1], 2 * fits[at][0] - sides[2] - sides[3])
             roll, pitch = (max(1.0 / math.sqrt(max(bend, 1e-3)), _FRAME_SIGMA_DEG) for bend in bends)
             self.said.append((*at, roll, pitch))
-        return self.found()
 
-    def found(self) -> FoundMount | None:
-        """The mount, once frames enough agree on it."""
-        if len(self.said) < _LEAST_FRAMES:
-            return None
+    def found(self) -> tuple[FoundMount | None, bool]:
+        """The mount by all frames so far, None before the first, and whether frames enough agree on it."""
+        if not self.said:
+            return None, False
         said = np.array(self.said)
         weight = said[:, 2:] ** -2.0
         mean = (weight * said[:, :2]).sum(axis=0) / weight.sum(axis=0)
         # Where frames scatter more than they say, none of them is as good as it says.
-        scatter = (weight * (said[:, :2] - mean) ** 2).sum(axis=0) / (len(said) - 1)
-        sigma = np.sqrt(np.maximum(scatter, 1.0) / weight.sum(axis=0))
-        if sigma.max() > _SETTLED_DEG:
-            return None
-        return FoundMount(self._mount((float(mean[0]), float(mean[1]))), math.radians(float(sigma.max())))
+        scatter = (weight * (said[:, :2] - mean) ** 2).sum(axis=0) / max(len(said) - 1, 1)
+        sigma = float(np.sqrt(np.maximum(scatter, 1.0) / weight.sum(axis=0)).max())
+        agreed = len(said) >= _LEAST_FRAMES and sigma <= _SETTLED_DEG
+        return FoundMount(self._mount((float(mean[0]), float(mean[1]))), math.radians(sigma)), agreed
 
     def _mount(self, off_deg: tuple[float, float]) -> Attitude:
         roll, pitch = (math.radians(v) for v in off_deg)

@@ -315,7 +315,7 @@ def test_a_file_of_another_network_is_refused(
 
 def test_a_file_of_another_version_is_refused(saved: Path, built: Maps) -> None:
     def change(edit: Callable[[dict[str, Any]], object]) -> str:
-        header, arrays = read_saved(saved, 1)
+        header, arrays = read_saved(saved, 2)
         before = saved.read_bytes()
         edit(header)
         write_saved(saved, header, arrays)
@@ -323,7 +323,7 @@ def test_a_file_of_another_version_is_refused(saved: Path, built: Maps) -> None:
         saved.write_bytes(before)
         return told
 
-    assert "format 2" in change(lambda h: h.update(format=2))
+    assert "format 1" in change(lambda h: h.update(format=1))
     assert "another version" in change(lambda h: h.pop("maps"))
     assert "another version" in change(lambda h: h["ways"].update(luck=1))
     assert "another version" in change(lambda h: h["ways"]["settings"]["paper"].pop("radii"))
