@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -21,10 +22,16 @@ from log_writers import (
     px4,
     turn_between,
 )
+from scipy.spatial.transform import Rotation
 from small_flights import command
 
+from brmgeo.flight import checks
 from brmgeo.flight.folder import Flight, read_flight
+from brmgeo.flight.logs import read_log
 from brmgeo.flight.logs.inspect import inspect
+from brmgeo.flight.odometry import read_odometry
+from brmgeo.flight.readings import BODY_FROM_NADIR_CAMERA
+from brmgeo.synth.flight import OdometryErrors, SimulationSettings, fly, lawnmower, odometry_of
 
 pytest.importorskip("rosbags")
 pytest.importorskip("pyulog")
@@ -286,3 +293,63 @@ def test_inspect_tells_what_is_in_a_log(tmp_path: Path) -> None:
     document = tmp_path / "logs.md"
     assert command("inspect", tmp_path / "log.ulg", tmp_path / "flight", "--write", document)[0] == 0
     assert document.read_text().count("\n## ") == 2
+
+
+def test_photos_that_tell_no_attitude_say_so_in_the_flight(tmp_path: Path) -> None:
+    photos = shots(tmp_path / "photos", 4)
+    flight = good(tmp_path / "untold", photos, "--agl", 60)
+    assert math.degrees(flight.mount_sigma_rad) == pytest.approx(10.0)
+    assert "sigma_deg = 10.0" in (tmp_path / "untold" / "flight.toml").read_text()
+    status, said = command("import", photos, "--agl", 60, "--out", tmp_path / "again")
+    assert status == 0
+    assert "known to 10 degrees: nothing tells how the camera looks" in said
+    assert good(tmp_path / "told", photos, "--agl", 60, "--mount", "0,-15,0").mount_sigma_rad == 0.0
+    gimbal = shots(tmp_path / "gimbal", 4, xmp=dji((0.0, -90.0, 46.0)))
+    assert good(tmp_path / "held", gimbal, "--agl", 60).mount_sigma_rad == 0.0
+
+
+def test_a_downward_cameras_track_is_refused_until_its_axes_are_told(tmp_path: Path) -> None:
+    course = fly(lawnmower((0.0, 0.0, 400.0, 300.0), 75.0), SimulationSettings(), 2)
+    track = odometry_of(course, OdometryErrors(), 2)
+    turn = Rotation.from_matrix(BODY_FROM_NADIR_CAMERA)
+    poses = turn.inv() * Rotation.from_quat(track.wxyz[:, [1, 2, 3, 0]]) * turn
+    xyz = turn.inv().apply(track.xyz_m)
+    rows = np.column_stack([track.t_s, xyz - xyz[0], poses.as_quat()])
+    np.savetxt(tmp_path / "camera.txt", rows, fmt="%.9f")
+    assert "give axes nadir (a camera that looks down)" in refused(tmp_path / "a", tmp_path / "camera.txt")
+    status, said = command("import", tmp_path / "camera.txt", "--axes", "nadir", "--out", tmp_path / "b")
+    assert status == 0, said
+    found = read_odometry(tmp_path / "b" / "odometry.csv", "csv")
+    assert checks.mirrored_m(found.xyz_m[:, :2], track.xyz_m[:, :2])[0] < 0.01
+    # Whole nanoseconds, as ORB-SLAM3 writes them, say nothing of the quaternion's order; the turns do.
+    lines = [" ".join([str(round(r[0] * 1e9) + 10**18), *(f"{v:.9f}" for v in r[1:])]) for r in rows]
+    (tmp_path / "ns.txt").write_text("\n".join(lines))
+    log = read_log(tmp_path / "ns.txt")
+    assert log.kind == "tum"
+    assert log.odometry is not None
+    assert log.odometry.t_s[0] == pytest.approx(1e9)
+
+
+@pytest.mark.parametrize(
+    ("head", "order"),
+    [
+        (
+            "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_x, v_y, v_z, b, b, b, b",
+            "xyzw",
+        ),
+        ("timestamp,x,y,z,qw,qx,qy,qz,vx,vy,vz,bgx,bgy,bgz,bax", "wxyz"),
+        (
+            "#timestamp [ns], p_x [m], p_y [m], p_z [m], q_x [], q_y [], q_z [], q_w [], v, v, v, b, b, b, b",
+            "xyzw",
+        ),
+    ],
+)
+def test_a_headers_names_tell_the_quaternions_order(tmp_path: Path, head: str, order: str) -> None:
+    cells = [[1658132905797695744 + i * 10**8, 0.5 * i, 0.0, 50.0, *turn, *[0.0] * 7] for i, turn in
+             enumerate(([0.0, 0.0, 0.0, 1.0] if order == "xyzw" else [1.0, 0.0, 0.0, 0.0],) * 60)]  # fmt: skip
+    lines = [head, *(",".join(map(str, row)) for row in cells)]
+    (tmp_path / "vio.csv").write_text("\n".join(lines))
+    log = read_log(tmp_path / "vio.csv")
+    assert log.odometry is not None
+    assert len(log.odometry.t_s) == 60
+    assert log.odometry.wxyz == pytest.approx(np.tile([1.0, 0.0, 0.0, 0.0], (60, 1)))
