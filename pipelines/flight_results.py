@@ -92,6 +92,14 @@ class FlightResults:
     attribution: str
 
     @property
+    def mount(self) -> dict[str, float]:
+        """How the camera sat, as far as was known, degrees."""
+        sits = self.flight.mount
+        angles = (sits.roll_rad, sits.pitch_rad, sits.yaw_rad, self.flight.mount_sigma_rad)
+        names = ("roll_deg", "pitch_deg", "yaw_deg", "sigma_deg")
+        return {name: round(math.degrees(angle), 4) for name, angle in zip(names, angles)}
+
+    @property
     def flight(self) -> Flight:
         """The flight."""
         return self.masks.flight
@@ -124,6 +132,7 @@ class FlightResults:
             "network": self.masks.network,
             "odometry": self.odometry,
             "interval_s": self.interval_s,
+            "mount": self.mount,
         }
         return {
             "flight": self.flight.name,
@@ -224,6 +233,12 @@ def _report(results: FlightResults) -> str:
             ("flight", f"{flight.name} ({results.source}), {len(estimates)} frames"),
             ("masks", results.masks.source),
             ("odometry", names["odometry"]),
+            (
+                "camera",
+                "mount roll {roll_deg:.1f}, pitch {pitch_deg:.1f}, yaw {yaw_deg:.1f}, known to {sigma_deg:.1f} deg".format(
+                    **results.mount
+                ),
+            ),
             ("height", f"{agl.min():.1f} to {agl.max():.1f} m above ground"),
             ("maps", f"{maps.folder.name} ({maps.crs}, {maps.ground.gsd_m:g} m per pixel)"),
             ("reference", "none" if truth is None else "of the flight folder; used for scores only"),

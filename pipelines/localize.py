@@ -95,6 +95,8 @@ def localize(
             f"{flight.folder / 'frames'}: the flight has masks only, and SIFT needs frames: do without it",
             needs="sift",
         )
+    if sensors is not None and sensors.tilt_deg is not None:
+        flight = replace(flight, mount_sigma_rad=math.radians(sensors.tilt_deg))
     as_given, own = flight, flight_settings or FlightSettings()
     if max_speed_m_s is not None:
         own = own.model_copy(update={"max_speed_m_s": max_speed_m_s})
@@ -121,14 +123,12 @@ def localize(
             "without",
             needs="compass",
         )
-    tilt_deg = None if sensors is None else sensors.tilt_deg
-    mount_sigma_rad = flight.mount_sigma_rad if tilt_deg is None else math.radians(tilt_deg)
     given, use = f"{source_of(flight)}: masks/ of the flight folder", network or NetworkUse()
     with frame_masks(flight, given, use, progress, maps.folder.name) as masks:
         with progress.stage(f"{flight.name} {method}") as bar:
             located = locate_flight(
                 maps, flight, masks, method=method, settings=settings, compass_yaw_rad=yaws,
-                mount_sigma_rad=mount_sigma_rad, each=bar.watch(serial_map),
+                mount_sigma_rad=flight.mount_sigma_rad, each=bar.watch(serial_map),
             )  # fmt: skip
         if located.found_mount is not None:
             # Odometry of the frames, and masks, were made with the other mount: all of it again with the one that was found.
@@ -148,10 +148,10 @@ def localize(
                 odometry=odometry,
                 attribution=attribution,
             )
-        if method == "mask" and mount_sigma_rad >= MIN_MOUNT_SIGMA_RAD:
+        if method == "mask" and flight.mount_sigma_rad >= MIN_MOUNT_SIGMA_RAD:
             progress.say(
-                f"{flight.name}: the camera's mount, known to {math.degrees(mount_sigma_rad):g} degrees, was not found: "
-                "fixes are no surer than it is"
+                f"{flight.name}: the camera's mount, known to {math.degrees(flight.mount_sigma_rad):g} degrees, was not "
+                "found: fixes are no surer than it is"
             )
         results = FlightResults(
             maps=maps,

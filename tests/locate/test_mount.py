@@ -21,7 +21,7 @@ from brmgeo.synth.flight import Simulator, fly, odometry_of, place, rectangle
 from brmgeo.synth.mission import read_ground, simulator_settings
 
 TRUE = Attitude(math.radians(-4.0), math.radians(-13.0))
-FRAMES = 14
+FRAMES = 8
 Feed = Callable[[Localizer, int, int], list[Estimate]]
 
 
@@ -98,7 +98,7 @@ def test_a_localizer_that_still_looks_for_its_mount_is_saved_whole(
     feed, _ = tilted
     whole = told_nothing(built)
     wanted = feed(whole, 0, FRAMES)
-    for cut in (2, FRAMES - 2):
+    for cut in (5,):
         here = told_nothing(built)
         feed(here, 0, cut)
         here.save(tmp_path / "state")

@@ -104,7 +104,7 @@ def test_the_methods_offered_are_those_that_there_are() -> None:
 def test_every_need_of_the_library_is_a_parameter_of_some_command() -> None:
     known: set[str | None] = {param.name for command in cli.commands.values() for param in command.params}
     # What a program aboard alone can give.
-    known |= {"reset_speed_m_s", "masks", "answer"}
+    known |= {"reset_speed_m_s", "masks", "answer", "mount_sigma_rad"}
     found = {}
     for path in sorted((ROOT / "brmgeo").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

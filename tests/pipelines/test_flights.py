@@ -241,6 +241,7 @@ def test_metrics_hold_all_settings_that_a_method_reads(
         "network": None,
         "odometry": "auto",
         "interval_s": FlightSettings().interval_s,
+        "mount": dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg", "sigma_deg"), 0.0),
     }
     assert set(written) == read & set(groups)
     for name, values in written.items():
@@ -299,7 +300,8 @@ def test_without_odometry_nothing_false_is_said(
     assert used["max_speed_m_s"] == 8
     assert (used["step_sigma_m"], used["step_sigma_share"]) == (20, 0.05)
     assert used["compass_sigma_rad"] == pytest.approx(math.radians(5))
-    assert used["attitude_sigma_rad"] == pytest.approx(math.radians(3))
+    assert used["attitude_sigma_rad"] == 0.0035
+    assert 0.0 < metrics["settings"]["localize"]["mount"]["sigma_deg"] <= 3.0
 
 
 @pytest.mark.parametrize(
