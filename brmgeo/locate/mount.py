@@ -85,7 +85,8 @@ class MountFinder:
         if best is None:
             return
         fits = {at: best}
-        for step in _STEPS_DEG:
+        # Once a frame has told it, others begin where it lies.
+        for step in _STEPS_DEG[2:] if self.said else _STEPS_DEG:
             before = None
             while before != at:
                 before = at

@@ -21,7 +21,7 @@ from brmgeo.synth.flight import Simulator, fly, odometry_of, place, rectangle
 from brmgeo.synth.mission import read_ground, simulator_settings
 
 TRUE = Attitude(math.radians(-4.0), math.radians(-13.0))
-FRAMES = 8
+FRAMES = 10
 Feed = Callable[[Localizer, int, int], list[Estimate]]
 
 
