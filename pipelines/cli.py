@@ -610,7 +610,7 @@ def simulate(
     "--tilt-sigma",
     "tilt_sigma_deg",
     type=click.FloatRange(0, 11),
-    help="Standard deviation of the camera mount's roll and pitch, degrees (default: what the flight says); from 1 on the "
+    help="Standard deviation of the camera mount's roll and pitch, degrees (default: what the flight says); from 4 on the "
     "mount is looked for.",
 )
 @click.option(

@@ -136,7 +136,7 @@ def localize(
             mount, sigma_rad = located.found_mount
             return localize(
                 maps_dir,
-                replace(as_given, mount=mount, mount_sigma_rad=min(sigma_rad, 0.999 * MIN_MOUNT_SIGMA_RAD)),
+                replace(as_given, mount=mount, mount_sigma_rad=sigma_rad),
                 method,
                 out,
                 flight_settings=flight_settings,

@@ -32,7 +32,9 @@ from brmgeo.match.state import State, under, within
 from brmgeo.segment.predict import Answer, Segmenter, picture_of
 
 #: From this on a mount's roll and pitch count as unknown, and are looked for; and the most that may be unknown.
-MIN_MOUNT_SIGMA_RAD, MAX_MOUNT_SIGMA_RAD = math.radians(1.0), math.radians(11.0)
+MIN_MOUNT_SIGMA_RAD, MAX_MOUNT_SIGMA_RAD = math.radians(4.0), math.radians(11.0)
+#: Another mount than this far off is worth levelling the flight so far anew.
+_ANEW_RAD = math.radians(1.0)
 #: Frames that wait for the mount, where no history keeps all of them.
 _MOST_WAITING = 60
 #: Of the saved file. Raised by hand when what it holds changes.
@@ -227,7 +229,7 @@ class Localizer:
         waiting = self._waiting
         if agreed:
             self._adopt(found)
-        elif _apart_rad(found.mount, self.mount) > MIN_MOUNT_SIGMA_RAD:
+        elif _apart_rad(found.mount, self.mount) > _ANEW_RAD:
             # Better than what was told, but not agreed on: views are levelled by it, and no place is surer for it.
             self.mount, self._matcher = found.mount, self._fresh(self._ways.mount_sigma_rad)
         else:
@@ -242,12 +244,16 @@ class Localizer:
         self._matcher = self._fresh(found.sigma_rad)
 
     def _fresh(self, mount_sigma_rad: float) -> Matcher:
-        """A matcher that has seen nothing and holds views for levelled as well as the mount is known."""
+        """A matcher that has seen nothing, of views that are levelled as well as the mount is known."""
         ways, odometry = self._ways, self._ways.settings.odometry
-        settings = ways.settings
-        if mount_sigma_rad > 0:
+        if self._finder is None:
+            sigma = math.hypot(odometry.mount_sigma_rad, mount_sigma_rad)
+            odometry = replace(odometry, mount_sigma_rad=sigma)
+        else:
+            # A mount that is far off is no constant: turns and heights make another error of it in each frame.
             sigma = math.hypot(odometry.attitude_sigma_rad, mount_sigma_rad)
-            settings = replace(settings, odometry=replace(odometry, attitude_sigma_rad=sigma))
+            odometry = replace(odometry, attitude_sigma_rad=sigma)
+        settings = ways.settings if mount_sigma_rad == 0 else replace(ways.settings, odometry=odometry)
         return make_matcher(ways.method, self.maps.ground, settings, history=ways.history)
 
     def view(

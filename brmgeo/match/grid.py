@@ -69,7 +69,9 @@ class GridMatcher:
 
     def _lasting_m(self, agl_m: float) -> float:
         """Error per axis that stays the same from frame to frame, metres: levelling, and what the method adds."""
-        return math.hypot(self.settings.odometry.attitude_sigma_rad * agl_m, self.scorer.systematic_m)
+        odometry = self.settings.odometry
+        levelling = math.hypot(odometry.attitude_sigma_rad, odometry.mount_sigma_rad)
+        return math.hypot(levelling * agl_m, self.scorer.systematic_m)
 
     # The filter
 

@@ -32,6 +32,8 @@ class OdometrySettings:
         max_speed_m_s: bound of the movement where odometry says nothing, metres per second, [0.1, 500].
         attitude_sigma_rad: standard deviation of the views' levelling, radians, [0, 0.2]: it moves a view by
             that angle times the height, each frame anew and once for the whole flight.
+        mount_sigma_rad: standard deviation of the camera mount's roll and of its pitch, radians, [0, 0.2]: it moves all
+            views of a flight alike, by that angle times the height, so it is added to what is reported alone.
         compass_sigma_rad: standard deviation of a trusted compass, radians, [0.001, pi].
         reset_keeps_heading: probability that the odometry frame's heading survives a step of None, [0, 1].
     """
@@ -43,6 +45,7 @@ class OdometrySettings:
     step_sigma_share: float = 0.01
     max_speed_m_s: float = 25.0
     attitude_sigma_rad: float = 0.0035
+    mount_sigma_rad: float = 0.0
     compass_sigma_rad: float = 0.15
     reset_keeps_heading: float = 0.5
 
@@ -56,6 +59,7 @@ class OdometrySettings:
             step_sigma_share=(0, 1),
             max_speed_m_s=(0.1, 500),
             attitude_sigma_rad=(0, 0.2),
+            mount_sigma_rad=(0, 0.2),
             compass_sigma_rad=(0.001, math.pi),
             reset_keeps_heading=(0, 1),
         )

@@ -73,7 +73,8 @@ def test_a_tilt_that_nobody_told_is_found_and_the_flight_located_with_it(
     assert here.found_mount is not None
     mount, sigma_rad = here.found_mount
     assert here.mount == mount
-    assert math.degrees(sigma_rad) <= 1.0
+    # Frames agree to a degree; what they get wrong together they cannot know.
+    assert 3.0 <= math.degrees(sigma_rad) <= math.hypot(3.0, 1.0)
     assert math.degrees(mount.roll_rad - TRUE.roll_rad) == pytest.approx(0.0, abs=1.5)
     assert math.degrees(mount.pitch_rad - TRUE.pitch_rad) == pytest.approx(0.0, abs=1.5)
     last = estimates[-1]
@@ -114,7 +115,7 @@ def test_a_localizer_that_still_looks_for_its_mount_is_saved_whole(
 
 def test_what_is_known_exactly_is_not_looked_for(built: Maps) -> None:
     camera = simulator_settings(FlightSettings()).camera
-    here = Localizer(built, camera, TRUE, mount_sigma_rad=math.radians(0.5))
+    here = Localizer(built, camera, TRUE, mount_sigma_rad=math.radians(3.5))
     assert here._finder is None
     assert replace(TRUE) == here.mount
     with pytest.raises(SettingsError, match="mount known to 20 degrees: give 0 to 11"):
