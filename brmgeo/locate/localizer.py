@@ -178,8 +178,7 @@ class Localizer:
         that does not increase, a picture that does not fit the camera, or readings that are no numbers; SettingsError for a
         picture where there is no network.
         """
-        if not (math.isfinite(t_s) and t_s > self._t_s):
-            raise InputError(f"a frame at {t_s} s after one at {self._t_s} s: times must increase")
+        self._require_later(t_s)
         read = [] if pose is None else [*pose.xyz_m, *pose.wxyz]
         if not all(map(math.isfinite, [*read, 0.0 if compass_yaw_rad is None else compass_yaw_rad])):
             raise InputError(
@@ -193,8 +192,13 @@ class Localizer:
         self, t_s: float, picture: NDArray[Any], attitude: Attitude, agl_m: float, motion: Motion
     ) -> Estimate:
         """As ``step``, with the motion since the frame before in place of poses."""
+        self._require_later(t_s)
         image, above_m = self._seen(t_s, picture, attitude, agl_m, "")
         return self._take(_Frame(t_s, image, attitude, above_m, motion, ""))
+
+    def _require_later(self, t_s: float) -> None:
+        if not (math.isfinite(t_s) and t_s > self._t_s):
+            raise InputError(f"a frame at {t_s} s after one at {self._t_s} s: times must increase")
 
     def _take(self, frame: _Frame) -> Estimate:
         self._t_s = frame.t_s

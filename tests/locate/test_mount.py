@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brmgeo.errors import SettingsError
+from brmgeo.errors import InputError, SettingsError
 from brmgeo.flight.motion import motions
 from brmgeo.flight.readings import Attitude
 from brmgeo.flight.values import Estimate
@@ -87,6 +87,8 @@ def test_a_tilt_that_nobody_told_is_found_and_the_flight_located_with_it(
         if estimate.position is not None:
             sigma = math.sqrt(float(np.trace(estimate.covariance)) / 2.0)
             assert np.hypot(*(estimate.mean - xy)) < 3.0 * sigma
+    with pytest.raises(InputError, match="times must increase"):
+        feed(here, 0, 1)
     # Read as straight down, and believed to be, the same flight is off by its tilt and does not know it.
     sure = told_nothing(built, mount_sigma_rad=0.0)
     wrong = [e for e in feed(sure, 0, 6) if e.position is not None]
