@@ -52,6 +52,8 @@ def working(tmp_path: Path, spec: str) -> tuple[subprocess.Popen[str], Path]:
         cwd=ROOT,
         env=os.environ | {"TMPDIR": str(scratch), "PYTHONPATH": str(ROOT)},
         start_new_session=True,
+        # The tests themselves may run under nohup, which a command inherits.
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     )
     assert run.stdout is not None
     line = run.stdout.readline()

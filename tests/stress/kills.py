@@ -261,7 +261,8 @@ def _killed(
     if how is signal.SIGTERM and status != 0:
         wrong += [f"{name} stays after SIGTERM" for name in litter(folder)]
     _age(folder)
-    if status != 0 or job.again:
+    # What may not be replaced and is whole already has no next run: it would be refused, and rightly.
+    if job.again or any(now.get(name) != value for name, value in same.items()):
         run = Run(job, folder)
         if (status := run.wait(300.0)) != 0:
             return [
